@@ -1,4 +1,5 @@
-//! What an application leaves switched wrong before it jumps into the bootloader: the bootloader works.
+//! What an application leaves switched wrong before it jumps into the bootloader, and what outlives a reset:
+//! the bootloader works.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
@@ -66,7 +67,7 @@ const CAN1: u32 = 0x4000_6400;
 const APB1_CLOCKS: u32 = 1 << 28 | 1 << 25 | 1 << 11 | 1 << 0;
 
 /// Registers by RM0090, and by ARMv7-M those of the core.
-const WRONG: [Wrong; 16] = [
+const WRONG: [Wrong; 20] = [
     Wrong { what: "PRIMASK and FAULTMASK set", stores: &[], core: INTERRUPTS_OFF | FAULTS_MASKED },
     Wrong { what: "BASEPRI set", stores: &[], core: PRIORITIES_MASKED },
     Wrong { what: "on the process stack", stores: &[], core: PROCESS_STACK },
@@ -98,6 +99,16 @@ const WRONG: [Wrong; 16] = [
         stores: &[(APB1ENR, APB1_CLOCKS), (0x4000_7000, 0xC006), (0xE000_ED10, 6)],
         core: 0,
     },
+    // After an interrupt the core would sleep again, and no work on the flash would be done (B1.5.17).
+    Wrong { what: "SLEEPONEXIT alone", stores: &[(SCR, 2)], core: 0 },
+    // Each sleep would be Stop, which no interrupt of a peripheral ends (RM0090 section 5.3.5).
+    Wrong { what: "SLEEPDEEP alone", stores: &[(SCR, 4)], core: 0 },
+    Wrong {
+        what: "PendSV pending, its priority and that of SysTick the lowest, no groups of priorities",
+        stores: &[(0xE000_ED20, 0xF0F0_0000), (0xE000_ED04, 1 << 28), (0xE000_ED0C, 0x05FA_0700)],
+        core: INTERRUPTS_OFF,
+    },
+    Wrong { what: "patches, breakpoints, watchpoints and vector catches", stores: &DEBUG_UNITS, core: 0 },
     Wrong {
         what: "flash open for programming by bytes, its caches off",
         stores: &[
@@ -155,6 +166,111 @@ const WRONG: [Wrong; 16] = [
     },
 ];
 
+const SCR: u32 = 0xE000_ED10;
+const FP_CTRL: u32 = 0xE000_2000;
+const FP_COMP0: u32 = 0xE000_2008;
+const DWT_CTRL: u32 = 0xE000_1000;
+const DEMCR: u32 = 0xE000_EDFC;
+
+/// The debug units switched on, by DDI 0403E sections C1.6, C1.8 and C1.11. No instruction of Reset follows
+/// its vector at 100h or 200h: the addresses do no harm by themselves.
+const DEBUG_UNITS: [(u32, u32); 18] = [
+    (DEMCR, 0x0100_07F1), // TRCENA, each vector catch
+    (DWT_CTRL, 1),
+    (0xE000_1020, 0x0800_0000), // COMP0: a read of the first word
+    (0xE000_1028, 5),
+    (0xE000_1038, 6),
+    (0xE000_1048, 7),
+    (0xE000_1058, 4),
+    (0x2001_0000, 0xE7FE_E7FE), // the new words: a jump to itself
+    (0x2001_0018, 0xE7FE_E7FE),
+    (0xE000_2004, 0x2001_0000),       // FP_REMAP
+    (FP_COMP0, 0x0800_0100 | 1),      // a patch
+    (FP_COMP0 + 4, 0xC800_0201),      // breakpoints
+    (FP_COMP0 + 8, 0x4800_0205),      //
+    (FP_COMP0 + 12, 0x8800_0209),     //
+    (FP_COMP0 + 20, 0xC800_020D),     //
+    (FP_COMP0 + 24, 0x0800_0104 | 1), // a patch of a literal
+    (FP_COMP0 + 28, 0x0800_0108 | 1),
+    (FP_CTRL, 3),
+];
+
+fn poke(bench: &mut Bench, stores: &[(u32, u32)]) {
+    for (register, value) in stores {
+        bench.machine().poke(*register, &value.to_le_bytes()).unwrap();
+    }
+}
+
+/// The registers of the core that have no value of the running bootloader, as after a power-on.
+fn residues(bench: &mut Bench) -> Vec<String> {
+    let comparators = (0..8).map(|n| FP_COMP0 + 4 * n).chain((0..4).map(|n| DWT_CTRL + 0x28 + 0x10 * n));
+    let zero = comparators.chain([DEMCR, SCR, 0xE000_ED94]).map(|register| (register, 0));
+    // FP_CTRL has the numbers of the comparators, DWT_CTRL that of its own, CCR has STKALIGN.
+    let others = [(FP_CTRL, 0x260), (DWT_CTRL, 0x4000_0000), (0xE000_ED14, 0x200)];
+    let all = zero
+        .chain(others)
+        .map(|(register, expected)| (register, expected, bench.machine().register(register)));
+    let wrong = all.filter(|(_, expected, found)| *found != Some(*expected));
+    wrong.map(|(register, _, found)| format!("{register:08X}h = {:08X}h", found.unwrap())).collect()
+}
+
+/// The patch unit, the watchpoints and the vector catches outlive each reset but a power reset (Cortex-M4
+/// technical reference manual, resets): a program that was taken over could patch the bootloader, and a
+/// forgotten breakpoint would end the trial of a good one.
+#[test]
+fn no_reset_leaves_a_patch_or_a_breakpoint() {
+    let vector = |image: &[u8]| u32::from_le_bytes(image[4..8].try_into().unwrap()) & !1;
+    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_SEALED] {
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        let mut words = [0; 8];
+        bench.machine().read_memory(firmware::board().bootloader.base, &mut words).unwrap();
+        // After the first instructions, which no program can guard, Reset goes straight on for some time.
+        let code = vector(&words) + 0x40;
+        let program = vector(&firmware::raw(firmware::APP_V1));
+        let in_reset = [(FP_COMP0, code | 1), (FP_COMP0 + 4, program | 0xC000_0001)];
+        for way in [ResetCause::Pin, ResetCause::Software, ResetCause::WindowWatchdog] {
+            poke(&mut bench, &DEBUG_UNITS);
+            poke(&mut bench, &in_reset);
+            assert_eq!(residues(&mut bench).len(), 14, "{way:?}: all is on");
+            bench.events();
+            match way {
+                ResetCause::Pin => bench.machine().reset_pin(),
+                ResetCause::Software => bench.post(0, &[0x81, NODE]),
+                // A counter below 40h (RM0090 section 22.3).
+                _ => poke(&mut bench, &[(APB1ENR, APB1_CLOCKS), (0x4000_2C00, 0x80)]),
+            }
+            bench.await_boot_up(1_000);
+            let was_so = bench.events().iter().any(|(_, stop)| *stop == Stop::Reset(way));
+            assert!(was_so || way == ResetCause::Pin, "{way:?}");
+            assert_eq!(residues(&mut bench), [""; 0], "{image}, {way:?}");
+        }
+        // A program whose first instruction had a breakpoint passes its trial.
+        let program = firmware::blocks(firmware::APP_V1);
+        flash(&mut bench.session(), &program, &FlashOptions::default(), &mut |_| {}).unwrap();
+        assert!(!bench.is_bootloader(NODE));
+    }
+}
+
+/// A developer's breakpoints stay over a reset, as long as the probe is there: it alone can set C_DEBUGEN (DDI
+/// 0403E C1.6.2). A sealed device makes no exception.
+#[test]
+fn an_open_device_leaves_a_probe_its_breakpoints() {
+    for (image, stays) in [(firmware::BOOTLOADER, true), (firmware::BOOTLOADER_SEALED, false)] {
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        assert!(bench.machine().attach_debugger());
+        poke(&mut bench, &[(FP_COMP0, 0xC802_0001), (FP_CTRL, 3)]);
+        bench.machine().resume(false);
+        bench.machine().reset_pin();
+        bench.await_boot_up(100);
+        let found = [FP_CTRL, FP_COMP0].map(|register| bench.machine().register(register).unwrap());
+        assert_eq!(found, if stays { [0x261, 0xC802_0001] } else { [0x260, 0] }, "{image}");
+    }
+}
+
 /// A program whose reset handler is these half-words; its other bytes are 0.
 fn image_of(code: impl IntoIterator<Item = u16>) -> Vec<u8> {
     let mut image = vec![0; 0x200];
@@ -211,6 +327,7 @@ fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
         // A second of the watchdog at 32 kHz, and a rescue window.
         bench.run_ms(2_000);
         let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        let stops = &stops[..stops.len().min(4)];
         println!("{}: {stops:?}", wrong.what);
         let answer = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], RESPONSE);
         if answer.is_none_or(|answer| answer[0] != 0x43) {
@@ -219,11 +336,16 @@ fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
             continue;
         }
         assert!(bench.is_bootloader(NODE), "{}", wrong.what);
+        let residues = residues(&mut bench);
+        let is_slow = stops.contains(&Stop::Reset(ResetCause::IndependentWatchdog));
+        if !residues.is_empty() || is_slow && !wrong.what.contains("watchdog") {
+            lost.push(format!("{}: {stops:?}, {residues:?}", wrong.what));
+        }
         // It can erase.
         bench.session().command(1, ProgramControl::Clear).unwrap();
         bench.session().await_idle(1, Doing::Block(0)).unwrap();
     }
-    assert!(lost.is_empty(), "not reachable after: {lost:#?}");
+    assert!(lost.is_empty(), "not reachable, or not clean, after: {lost:#?}");
 }
 
 /// A program that jumps with the caches of the flash on or held in reset, into a bootloader that erases and

@@ -38,7 +38,7 @@ use core::arch::global_asm;
 
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::geometry::CORE_VECTORS;
-use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
+use shared_abi::layout::{KNOWS_SEALED_IMAGES, LEAST_STACK, MARK_OFFSET};
 use shared_abi::services::{self, Services};
 use shared_abi::warm_start::BootRequest;
 
@@ -66,25 +66,88 @@ global_asm!(
     fault = sym fault,
 );
 
-// Reset takes the vectors (an application that jumps here may have left its own) and enables the
-// FPU, whose registers the compiler may use to move data.
+// Reset makes the core as after a power-on (docs/architecture.md, "What a reset leaves"): a reset leaves the
+// debug units, and an application that jumps here everything else. The vectors, the FPU, whose registers
+// the compiler may use to move data, and the stack are those of the resident part.
+//
+// The patch unit (FPB) comes first, with immediate values alone: it may replace every instruction and every
+// constant in flash. In an open device the breakpoints of a debug probe stay; only a probe can set C_DEBUGEN.
 global_asm!(
     ".section .text.resident_reset, \"ax\"",
     ".global resident_reset",
     ".type resident_reset,%function",
     ".thumb_func",
     "resident_reset:",
-    "ldr r0, =0xE000ED08", // VTOR (ARMv7-M B3.2.5)
-    "ldr r1, ={vectors}",
-    "str r1, [r0]",
-    "ldr r1, [r0, #0x80]", // CPACR (ARMv7-M B3.2.20)
-    "orr r1, r1, #0xF00000",
-    "str r1, [r0, #0x80]",
+    "cpsid i",
+    "mov r0, #0xE000E000", // the system control space, SCS (ARMv7-M B3.2)
+    "movs r1, #0",
+    ".if !{is_sealed}",
+    "ldr r2, [r0, #0xDF0]", // DHCSR (C1.6.2), C_DEBUGEN
+    "lsls r2, r2, #31",
+    "bne 1f",
+    ".endif",
+    "sub r2, r0, #0xC000", // FPB (C1.11)
+    "movs r3, #2",
+    "str r3, [r2], #8", // FP_CTRL: KEY without ENABLE
+    "dsb",
+    "isb", // from here on each instruction is the one in flash
+    "movs r3, #32",
+    "0: subs r3, #4",
+    "str r1, [r2, r3]", // FP_COMP7 to 0
+    "bne 0b",
+    "mov r3, #0x01000000",
+    "str r3, [r0, #0xDFC]", // DEMCR (C1.6.5), TRCENA: without it the DWT may ignore what is written
+    "sub r2, r0, #0xD000", // DWT (C1.8)
+    "str r1, [r2]",
+    "str r1, [r2, #0x28]", // DWT_FUNCTION0 to 3
+    "str r1, [r2, #0x38]",
+    "str r1, [r2, #0x48]",
+    "str r1, [r2, #0x58]",
+    "str r1, [r0, #0xDFC]", // DWT and ITM off, no vector catch
+    "1:",
+    "str r1, [r0, #0xD94]", // MPU_CTRL
+    "str r1, [r0, #0xD10]", // SCR
+    "str r1, [r0, #0xD24]", // SHCSR
+    "str r1, [r0, #0x10]", // SYST_CSR
+    "mov r2, #0x200",
+    "str r2, [r0, #0xD14]", // CCR: STKALIGN
+    "mov r2, #0x0A000000",
+    "str r2, [r0, #0xD04]", // ICSR: PendSV and SysTick no longer pending
+    "mvns r2, r1",
+    "add r4, r0, #0x180", // NVIC_ICER0 to 3, NVIC_ICPR0 to 3
+    "add r5, r0, #0x280",
+    "movs r3, #16",
+    "0: subs r3, #4",
+    "str r2, [r4, r3]",
+    "str r2, [r5, r3]",
+    "bne 0b",
+    "ldr r2, ={vectors}",
+    "str r2, [r0, #0xD08]", // VTOR
+    "mov r2, #0xF00000",
+    "str r2, [r0, #0xD88]", // CPACR
+    "msr BASEPRI, r1",
+    "msr CONTROL, r1",
+    "ldr r2, =_stack_start",
+    "msr MSP, r2",
     "dsb",
     "isb",
+    ".if {is_sealed}",
+    // The memory of the boot stage's stack, and the registers of the FPU, which no reset clears, may have a
+    // secret of the RAM image.
+    "sub r3, r2, #{least_stack}",
+    "mov r4, r3",
+    "0: str r1, [r3], #4",
+    "cmp r3, r2",
+    "bne 0b",
+    "vldmia r4, {{s0-s31}}",
+    ".endif",
+    "cpsie f",
+    "cpsie i",
     "b {stage}",
     ".ltorg",
+    is_sealed = const product::SEALED as u32,
     vectors = const bsp::LAYOUT.bootloader.base,
+    least_stack = const LEAST_STACK,
     stage = sym stage::stage,
 );
 

@@ -12,6 +12,7 @@ use boot_core::program::{verify, Invalid};
 use boot_core::store::{Key, Parameters as _, ProgramRecord};
 use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
+use cortex_m::peripheral::scb::VectActive;
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
@@ -21,7 +22,7 @@ use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
 
 use crate::caches::Caches;
 use crate::flash::{CrcUnit, ResidentFlash};
-use crate::{renewal, storing};
+use crate::{ram_image, renewal, storing};
 use product::{self, NO_NODE_ID, PRODUCT, SEALED};
 
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
@@ -54,9 +55,11 @@ pub unsafe extern "C" fn stage() -> ! {
     rcc.csr().write(|w| unsafe { w.bits(status.bits()).rmvf().set_bit() });
     let reset_cause = ResetCause::from_flags(status.bits(), bsp::low_power::take(&rcc));
 
-    // Without a reset cause an application has jumped here. The flash may be locked, and the watchdog,
-    // whose clock is the LSI, may run. A reset ends both; the request stays in the cell.
-    if reset_cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set()) {
+    // Without a reset cause an application has jumped here. The flash may be locked, the watchdog, whose
+    // clock is the LSI, may run, and an exception may be active. A reset ends all; the request stays in the
+    // cell.
+    let in_handler = || SCB::vect_active() != VectActive::ThreadMode;
+    if reset_cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set() || in_handler()) {
         SCB::sys_reset();
     }
 
@@ -85,6 +88,10 @@ pub unsafe extern "C" fn stage() -> ! {
     };
     // SAFETY: as above; nothing else changes the register until it is dropped.
     let caches = unsafe { Caches::on() };
+    if SEALED {
+        // SAFETY: nothing but the stack uses the RAM.
+        unsafe { ram_image::wipe() };
+    }
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
