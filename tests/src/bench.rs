@@ -215,8 +215,16 @@ impl Bench {
     /// # Panics
     /// If the program does not start within a second.
     pub fn power_on_to_first_instruction(&mut self) -> Span {
-        let from: Time = self.time();
         self.power_on();
+        self.run_to_first_instruction()
+    }
+
+    /// The same from now on, without the power.
+    ///
+    /// # Panics
+    /// If the program does not start within a second.
+    pub fn run_to_first_instruction(&mut self) -> Span {
+        let from: Time = self.time();
         loop {
             self.world.run_for(Span::from_micros(10));
             if firmware::board().programs[0].contains(self.machine().pc(), 2) {

@@ -1,4 +1,6 @@
-//! ChaCha20 (RFC 8439, 2.4), optimised for size.
+//! ChaCha20 (RFC 8439, 2.4), optimised for size. It leaves nothing of the key on the stack.
+
+use zeroize::Zeroize;
 
 use crate::words::words;
 
@@ -13,8 +15,9 @@ pub fn apply(key: &[u8; 32], nonce: &[u8; 12], counter: u32, data: &mut [u8]) {
     words(key, &mut start[4..12]);
     words(nonce, &mut start[13..]);
     start[12] = counter;
+    let mut s = [0; 16];
     for part in data.chunks_mut(64) {
-        let mut s = start;
+        s.copy_from_slice(&start);
         for round in 0..80 {
             quarter(&mut s, round);
         }
@@ -24,6 +27,8 @@ pub fn apply(key: &[u8; 32], nonce: &[u8; 12], counter: u32, data: &mut [u8]) {
         }
         start[12] = start[12].wrapping_add(1);
     }
+    start.zeroize();
+    s.zeroize();
 }
 
 /// Quarter round `n` of 80: four down the columns, four down the diagonals, repeated.

@@ -1,7 +1,10 @@
 //! SHA-512, SHA-512/256 (FIPS 180-4) and HMAC-SHA-512 (RFC 2104), optimised for size.
 //!
 //! The current block is also the message schedule: sixteen words, one of which is replaced in each
-//! round. A hash therefore needs 200 bytes of RAM for any message.
+//! round. A hash therefore needs 200 bytes of RAM for any message. An HMAC leaves nothing of its key on the
+//! stack.
+
+use zeroize::Zeroize;
 
 /// Words of the state.
 const STATE: usize = 8;
@@ -153,6 +156,7 @@ impl Sha512 {
         for (state, word) in self.state.iter_mut().zip(&moving) {
             *state = state.wrapping_add(*word);
         }
+        moving.zeroize();
     }
 }
 
@@ -175,16 +179,22 @@ pub fn hash_256(parts: &[&[u8]]) -> [u8; 32] {
 /// HMAC-SHA-512 of these parts in sequence.
 #[must_use]
 pub fn hmac(key: &[u8; 32], parts: &[&[u8]]) -> [u8; 64] {
-    let keyed = |pad: u8| {
-        let mut hash = Sha512::new();
+    let mut hash = Sha512::new();
+    let start = |hash: &mut Sha512, pad: u8| {
+        hash.state = START;
+        hash.length = 0;
         for at in 0..128 {
             hash.push(key.get(at).unwrap_or(&0) ^ pad);
         }
-        hash
     };
-    let mut inner = keyed(0x36);
-    parts.iter().for_each(|part| inner.update(part));
-    let mut outer = keyed(0x5c);
-    outer.update(&inner.finish());
-    outer.finish()
+    start(&mut hash, 0x36);
+    parts.iter().for_each(|part| hash.update(part));
+    let mut inner = hash.finish();
+    start(&mut hash, 0x5c);
+    hash.update(&inner);
+    inner.zeroize();
+    let mac = hash.finish();
+    hash.state.zeroize();
+    hash.block.zeroize();
+    mac
 }

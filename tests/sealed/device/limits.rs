@@ -11,7 +11,10 @@ use coflash_core::device::Transfers;
 use coflash_core::file::sealed::Sealer;
 use emulator::bus::Outcome;
 use emulator::time::{Span, Time};
+use hmac::{Hmac, KeyInit, Mac};
 use seal::access::{right, DOMAIN, SIGNED_CHALLENGE};
+use sha2::block_api::compress512;
+use sha2::Sha512;
 
 use super::{call_back, kinds, start, status};
 
@@ -268,48 +271,137 @@ fn updates_take_4_kib_of_the_stack_at_most() {
     assert!(depth <= MOST, "{depth} bytes of the stack are used");
 }
 
-/// Eight bytes of the key, plain or as HMAC uses them (RFC 2104: exclusive-or 36h and 5Ch), in the
-/// order of memory or of SHA-512's words (FIPS 180-4: most significant byte first).
-fn traces_of_the_key() -> Vec<[u8; 8]> {
-    let mut traces = Vec::new();
-    for mask in [0, 0x36, 0x5C] {
-        for part in KEK.windows(8) {
-            let mut trace: [u8; 8] = part.try_into().expect("eight bytes");
-            trace.iter_mut().for_each(|byte| *byte ^= mask);
-            traces.push(trace);
-            trace.reverse();
-            traces.push(trace);
-        }
+/// Eight bytes of each secret, in the order of memory or of SHA-512's words (FIPS 180-4: most significant byte
+/// first).
+struct Traces(Vec<[u8; 8]>);
+
+impl Traces {
+    fn of(secrets: &[&[u8]]) -> Self {
+        let parts = secrets.iter().flat_map(|secret| secret.windows(8));
+        let traces = parts.map(|part| <[u8; 8]>::try_from(part).expect("eight bytes"));
+        Self(traces.flat_map(|trace| [trace, u64::from_le_bytes(trace).to_be_bytes()]).collect())
     }
-    traces
+
+    /// Whether memory has one.
+    fn are_in(&self, memory: &[u8]) -> bool {
+        let two = |bytes: &[u8]| usize::from(bytes[0]) << 8 | usize::from(bytes[1]);
+        // All of the RAM is searched at each look: few places begin as a trace does.
+        let mut begins = vec![false; 1 << 16];
+        self.0.iter().for_each(|trace| begins[two(trace)] = true);
+        memory.windows(8).any(|window| begins[two(window)] && self.0.iter().any(|trace| trace == window))
+    }
+
+    /// Whether the RAM has one, that of the core included.
+    fn are_left(&self, bench: &Bench) -> bool {
+        let chip = firmware::board().chip;
+        [chip.sram, chip.ccm].into_iter().any(|ram| {
+            let mut bytes = vec![0; ram.size as usize];
+            bench.world.machine(bench.device).read_memory(ram.base, &mut bytes).expect("it is RAM");
+            self.are_in(&bytes)
+        })
+    }
 }
 
-fn holds_a_trace(memory: &[u8], traces: &[[u8; 8]]) -> bool {
-    let two = |bytes: &[u8]| usize::from(bytes[0]) << 8 | usize::from(bytes[1]);
-    // All of the RAM is searched at each look: few places begin as a trace does.
-    let mut begins = vec![false; 1 << 16];
-    traces.iter().for_each(|trace| begins[two(trace)] = true);
-    let is_trace = |window: &[u8]| begins[two(window)] && traces.iter().any(|trace| trace == window);
-    memory.windows(8).any(is_trace)
+/// The first state of SHA-512 (FIPS 180-4, 5.3.5).
+#[rustfmt::skip]
+const FIRST_STATE: [u64; 8] = [
+    0x6a09_e667_f3bc_c908, 0xbb67_ae85_84ca_a73b, 0x3c6e_f372_fe94_f82b, 0xa54f_f53a_5f1d_36f1,
+    0x510e_527f_ade6_82d1, 0x9b05_688c_2b3e_6c1f, 0x1f83_d9ab_fb41_bd6b, 0x5be0_cd19_137e_2179,
+];
+
+/// What opens other images, and what opens this encrypted one alone, by RFC 2104 and the layout of the file: the
+/// key-encryption key, plain and as HMAC uses it, and the states of HMAC after it; the stream that wraps the
+/// key of the image, and this key.
+fn secrets(file: &[u8]) -> (Traces, Traces) {
+    let masked = [0x36, 0x5C].map(|mask| std::array::from_fn(|at| KEK.get(at).unwrap_or(&0) ^ mask));
+    let states = masked.map(|block: [u8; 128]| {
+        let mut state = FIRST_STATE;
+        compress512(&mut state, &[block]);
+        state.map(u64::to_be_bytes).concat()
+    });
+    let mut mac = Hmac::<Sha512>::new_from_slice(&KEK).expect("any length");
+    mac.update(b"coboot key 1\0");
+    mac.update(&file[104..120]);
+    let stream = mac.finalize().into_bytes();
+    // The manifest has one record: tag, length, id of the key, check, wrapped key.
+    let key: Vec<u8> =
+        file[176 + 16..][..32].iter().zip(&stream).map(|(wrapped, stream)| wrapped ^ stream).collect();
+    let of_all = Traces::of(&[&KEK, &masked[0][..32], &masked[1][..32], &states[0], &states[1]]);
+    (of_all, Traces::of(&[&stream[..32], &key]))
 }
 
-/// The key-encryption key is only in flash: RAM can be read out of a chip with protected flash.
+/// Sends CLEAR and the first half of a file.
+fn send_half(bench: &mut Bench, file: &[u8]) {
+    bench.session().command(1, ProgramControl::Clear).unwrap();
+    bench.run_ms(2_000);
+    let [a, b, c, d] = (file.len() as u32).to_le_bytes();
+    assert_eq!(bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 1, a, b, c, d], RESPONSE).unwrap()[0], 0x60);
+    for (number, segment) in file[..file.len() / 2].chunks_exact(7).enumerate() {
+        let request = [&[(number as u8 & 1) << 4], segment].concat();
+        assert_eq!(bench.ask(REQUEST, &request, RESPONSE).unwrap()[0], 0x20 | (number as u8 & 1) << 4);
+    }
+    bench.run_ms(20);
+}
+
+/// The key-encryption key is only in flash, and the key of an image in RAM while it is installed: RAM can be
+/// read out of a chip with protected flash.
 #[test]
-fn the_key_encryption_key_leaves_no_trace_in_ram() {
-    let traces = traces_of_the_key();
+fn no_secret_outlives_its_use() {
     let [_, (_, encrypted), ..] = kinds(COUNTER);
-    let file = encrypted.seal(&code(20), &release()).expect("it can be sealed");
+    let seal = |image: &[u8]| encrypted.seal(image, &release()).expect("it can be sealed");
+    let (file, other) = (seal(&code(20)), seal(&code(24)));
+    let (of_all, of_file) = secrets(&file);
+    let (_, of_other) = secrets(&other);
     let mut bench = board_at(BitRate::K1000);
-    assert!(holds_a_trace(bench.machine().flash(), &traces), "it is found where it is");
+    assert!(of_all.are_in(bench.machine().flash()), "it is found where it is");
     let mut looks = 0;
-    let sram = firmware::board().chip.sram;
-    let mut ram = vec![0; sram.size as usize];
     let mut look = |bench: &Bench| {
-        bench.world.machine(bench.device).read_memory(sram.base, &mut ram).expect("it is RAM");
-        assert!(!holds_a_trace(&ram, &traces), "look {looks}");
+        assert!(!of_all.are_left(bench), "look {looks}");
         looks += 1;
     };
     assert_eq!(send_and_ask(&mut bench, &file, &mut look), status::OK);
-    look(&bench);
     assert!(looks >= 2);
+    let mut left = Vec::new();
+    let mut look = |bench: &mut Bench, what: &'static str| {
+        let found = [&of_all, &of_file, &of_other].map(|traces| traces.are_left(bench));
+        if found.contains(&true) {
+            left.push((what, found));
+        }
+    };
+    look(&mut bench, "after the installation");
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.run_to_first_instruction();
+    look(&mut bench, "at the start of the program");
+    bench.await_boot_up(1_000);
+    call_back(&mut bench);
+
+    // The same image again erases nothing: after a reset in the middle the program starts at once.
+    send_half(&mut bench, &file);
+    assert!(of_file.are_left(&bench), "in use");
+    bench.machine().reset_pin();
+    bench.run_to_first_instruction();
+    look(&mut bench, "in a program after a reset in the middle");
+    bench.await_boot_up(1_000);
+    call_back(&mut bench);
+
+    for what in ["an abort by the client", "a reset", "CLEAR"] {
+        send_half(&mut bench, &other);
+        assert!(of_other.are_left(&bench), "{what}: in use");
+        match what {
+            "an abort by the client" => bench.post(REQUEST, &[0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]),
+            "CLEAR" => bench.session().command(1, ProgramControl::Clear).unwrap(),
+            _ => bench.machine().reset_pin(),
+        }
+        bench.run_ms(2_000);
+        look(&mut bench, what);
+    }
+    // A second CLEAR without data needs a right.
+    bench.machine().reset_pin();
+    bench.await_boot_up(1_000);
+    let mut broken = other.clone();
+    *broken.last_mut().unwrap() ^= 1;
+    let word = send_and_ask(&mut bench, &broken, &mut |_| {});
+    assert_eq!(word, status::SIGNATURE);
+    look(&mut bench, "a refusal");
+    assert!(left.is_empty(), "[secrets of all, of the first image, of the other one]: {left:#?}");
 }

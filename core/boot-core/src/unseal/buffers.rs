@@ -4,6 +4,7 @@ use seal::ed25519::Verification;
 use seal::lzma::Decoder;
 use seal::sha512::Sha512;
 use seal::wire::{HASH, MAX_CHUNK, MAX_HEAD};
+use zeroize::Zeroize;
 
 /// The most bytes that the decoder leaves for the next chunk.
 pub(super) const CARRY: usize = 24;
@@ -22,6 +23,8 @@ pub(super) struct Buffers {
     /// The hash of the chunk that is being received, or of the flash that is being hashed.
     pub hash: Sha512,
     pub head: [u8; MAX_HEAD],
+    /// The key of the chunks, if they are encrypted.
+    pub key: [u8; 32],
     /// A chunk, and the decompressed bytes after it.
     pub bytes: [u8; UNPACKED + UNPACK],
 }
@@ -34,8 +37,15 @@ impl Buffers {
             lzma: Decoder::new(),
             hash: Sha512::IDLE,
             head: [0; MAX_HEAD],
+            key: [0; 32],
             bytes: [0; UNPACKED + UNPACK],
         }
+    }
+
+    /// Removes the secrets: the key, and what was decrypted.
+    pub(super) fn wipe(&mut self) {
+        self.key.zeroize();
+        self.bytes.zeroize();
     }
 }
 

@@ -48,8 +48,6 @@ struct Chain {
     left: u32,
     /// The bytes of the image that are in flash.
     done: u32,
-    /// The key of the chunks, if they are encrypted.
-    key: [u8; 32],
     /// The other program, if it is the dictionary; otherwise an empty region.
     dictionary: Region,
 }
@@ -95,12 +93,7 @@ struct Payload {
 }
 
 impl Content {
-    pub(super) fn new(
-        acceptance: Acceptance,
-        key: [u8; 32],
-        dictionary: Option<Region>,
-        buffers: &mut Buffers,
-    ) -> Self {
+    pub(super) fn new(acceptance: Acceptance, dictionary: Option<Region>, buffers: &mut Buffers) -> Self {
         let head = Head(&buffers.head);
         buffers.lzma.reset();
         buffers.hash = Sha512::new_256();
@@ -108,7 +101,6 @@ impl Content {
             next: head.chain(),
             left: head.payload(),
             done: 0,
-            key,
             dictionary: dictionary.unwrap_or(Region::new(0, 0)),
         };
         let phase = match dictionary {
@@ -268,7 +260,7 @@ impl Payload {
             let before = head.payload() - chain.left - (self.end - self.clear) as u32;
             let end = self.end.min(self.clear + STEP);
             let [nonce @ .., _, _, _, _] = head.nonce();
-            chacha20::apply(&chain.key, &nonce, before / 64, &mut buffers.bytes[self.clear..end]);
+            chacha20::apply(&buffers.key, &nonce, before / 64, &mut buffers.bytes[self.clear..end]);
             self.clear = end;
             return Ok(None);
         }

@@ -7,6 +7,7 @@ use seal::wire::{array, flag, head_size, Fault, Head, Recipient, Requirements, W
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
+use zeroize::Zeroize;
 
 use super::buffers::{start, Buffers};
 use super::content::{Acceptance, Content, Same};
@@ -168,13 +169,14 @@ impl Image {
                 self.stage = Stage::Manifest(*judged);
             }
             Stage::Manifest(judged) => {
-                let key = judged.key(self.place.layout, buffers, flash)?;
+                judged.unwrap_key(self.place.layout, buffers, flash)?;
                 *accepted = true;
                 let dictionary = self.place.dictionary(buffers, flash, parameters)?;
-                self.stage = Stage::Content(Content::new(judged.acceptance, key, dictionary, buffers));
+                self.stage = Stage::Content(Content::new(judged.acceptance, dictionary, buffers));
             }
             Stage::Content(content) => {
                 if content.advance(self.place.region, buffers, flash, queue)? {
+                    buffers.wipe();
                     self.stage =
                         Stage::Installed(Installed { acceptance: content.acceptance(), raises: true });
                 }
@@ -305,26 +307,25 @@ impl Place {
 }
 
 impl Judged {
-    /// The key of the chunks; zeros if they are not encrypted.
-    fn key<F: Flash>(&self, layout: &Layout, buffers: &Buffers, flash: &F) -> Result<[u8; 32], Fault> {
-        let mut key = [0; 32];
-        let Some((at, recipient)) = self.recipient else { return Ok(key) };
+    /// Unwraps the key of the chunks, if they are encrypted, at its place in the buffers: nothing of it, or
+    /// of the key-encryption key, stays on the stack.
+    fn unwrap_key<F: Flash>(&self, layout: &Layout, buffers: &mut Buffers, flash: &F) -> Result<(), Fault> {
+        let Some((at, recipient)) = self.recipient else { return Ok(()) };
         let head = Head(&buffers.head);
         let recipient = array(head.0, recipient);
         let recipient = Recipient(&recipient);
         let mut secret = [0; 32];
         flash.read(layout.key_block().base + at as u32 + 4, &mut secret);
-        let stream = hmac(&secret, &[WRAP_DOMAIN, &head.nonce()]);
-        // From here on no copy of it is left in RAM.
-        secret = [0; 32];
-        core::hint::black_box(&secret);
-        if stream[32..40] != recipient.check() {
-            return Err(Fault::Key);
+        let mut stream = hmac(&secret, &[WRAP_DOMAIN, &head.nonce()]);
+        secret.zeroize();
+        let is_ours = stream[32..40] == recipient.check();
+        if is_ours {
+            for ((key, wrapped), stream) in buffers.key.iter_mut().zip(recipient.wrapped()).zip(&stream) {
+                *key = wrapped ^ stream;
+            }
         }
-        for ((key, wrapped), stream) in key.iter_mut().zip(recipient.wrapped()).zip(stream) {
-            *key = wrapped ^ stream;
-        }
-        Ok(key)
+        stream.zeroize();
+        is_ours.then_some(()).ok_or(Fault::Key)
     }
 }
 

@@ -144,7 +144,7 @@ impl<'b> Unsealer<'b> {
     /// Ends the processing of an image, or of a request.
     pub(crate) fn rest(&mut self) {
         if let Some(workshop) = self.0.get_mut() {
-            workshop.work = Work::Idle;
+            workshop.rest();
         }
     }
 
@@ -169,7 +169,7 @@ impl<'b> Unsealer<'b> {
     fn end(&mut self, outcome: Outcome) {
         let Some(workshop) = self.0.get_mut() else { return };
         workshop.news.outcome = outcome;
-        workshop.work = Work::Idle;
+        workshop.rest();
     }
 
     /// Returns what was found out since the last call.
@@ -265,6 +265,14 @@ impl Work {
 }
 
 impl Workshop {
+    /// Ends the work, and removes its secrets.
+    fn rest(&mut self) {
+        if matches!(self.work, Work::Image(_)) {
+            self.buffers.wipe();
+        }
+        self.work = Work::Idle;
+    }
+
     fn advance<F: Flash>(
         &mut self,
         flash: &F,
