@@ -127,19 +127,17 @@ global_asm!(
     "str r2, [r0, #0xD88]", // CPACR
     "msr BASEPRI, r1",
     "msr CONTROL, r1",
-    "ldr r2, =_stack_start",
-    "msr MSP, r2",
+    "ldr r1, =_stack_start",
+    "msr MSP, r1",
     "dsb",
     "isb",
     ".if {is_sealed}",
     // The memory of the boot stage's stack, and the registers of the FPU, which no reset clears, may have a
     // secret of the RAM image.
-    "sub r3, r2, #{least_stack}",
-    "mov r4, r3",
-    "0: str r1, [r3], #4",
-    "cmp r3, r2",
-    "bne 0b",
-    "vldmia r4, {{s0-s31}}",
+    "sub r0, r1, #{least_stack}",
+    "bl {clear}",
+    "sub r0, #128",
+    "vldmia r0, {{s0-s31}}",
     ".endif",
     "cpsie f",
     "cpsie i",
@@ -148,6 +146,7 @@ global_asm!(
     is_sealed = const product::SEALED as u32,
     vectors = const bsp::LAYOUT.bootloader.base,
     least_stack = const LEAST_STACK,
+    clear = sym ram_image::clear,
     stage = sym stage::stage,
 );
 

@@ -80,7 +80,7 @@ pub unsafe fn load(flash: &ResidentFlash, place: Region) -> Result<VectorTable, 
 
 /// Removes the secrets that the RAM image may have left, wherever a reset has ended it: clears all of the RAM but
 /// the last [`LEAST_STACK`] bytes, which Reset has cleared. The RAM of a program that has run since stays as it
-/// is: the handoff, which the report of a RAM image replaces, says which of them it was. 0.5 ms.
+/// is: the handoff, which the report of a RAM image replaces, says which of them it was. 0.3 ms.
 ///
 /// # Safety
 /// Nothing may use the RAM except its last [`LEAST_STACK`] bytes.
@@ -89,10 +89,27 @@ pub unsafe fn wipe() {
     if unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) } != 0 {
         return;
     }
-    const { assert!((LAYOUT.ram.size - LEAST_STACK).is_multiple_of(16)) };
-    for at in (LAYOUT.ram.base..LAYOUT.ram.end() - LEAST_STACK).step_by(16) {
-        // SAFETY: it is in the RAM, and aligned; the caller guarantees that nothing uses it. Volatile: a call
-        // of memset would clear by bytes.
-        unsafe { (at as *mut [u32; 4]).write_volatile([0; 4]) };
-    }
+    const { assert!(LAYOUT.ram.size > LEAST_STACK && LAYOUT.ram.size.is_multiple_of(64)) };
+    // SAFETY: it is in the RAM; the caller guarantees that nothing uses it.
+    unsafe { clear(LAYOUT.ram.base, LAYOUT.ram.end() - LEAST_STACK) };
+}
+
+/// Clears memory, 64 bytes at a time, without a stack: Reset calls it, too.
+///
+/// # Safety
+/// Both are addresses of words in RAM, `end` is a multiple of 64 bytes after `at`, and nothing uses the memory.
+#[unsafe(naked)]
+pub unsafe extern "C" fn clear(at: u32, end: u32) {
+    core::arch::naked_asm!(
+        "movs r2, #0",
+        "movs r3, #64",
+        "0: subs r3, #4",
+        "str r2, [r0, r3]",
+        "bne 0b",
+        "vldmia r0, {{s0-s15}}",
+        "1: vstmia r0!, {{s0-s15}}",
+        "cmp r0, r1",
+        "bne 1b",
+        "bx lr",
+    )
 }
