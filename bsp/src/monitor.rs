@@ -108,19 +108,6 @@ fn change_demcr(clear: u32, set: u32) {
     }
 }
 
-/// Turns breakpoints off, before any other code of the program and before its memory is
-/// initialised. Breakpoints outlast a reset, but the exception does not, so a breakpoint that is
-/// hit before [`arm`] would be a fault.
-///
-/// # Safety
-/// Only the start-up of `cortex-m-rt` may call it.
-#[unsafe(no_mangle)]
-#[unsafe(naked)]
-pub unsafe extern "C" fn __pre_init() {
-    // FP_CTRL: the key, with the enable bit clear.
-    naked_asm!("movw r0, #0x2000", "movt r0, #0xE000", "movs r1, #2", "str r1, [r0]", "dsb", "isb", "bx lr")
-}
-
 /// Enables breakpoints, of which there are none yet, unless the chip's read-out protection is on.
 /// `priority` is the exception's in the core's encoding (the upper four bits): more urgent (a lower
 /// value) than that of the code to be stopped, and less urgent than that of the tasks that serve

@@ -476,8 +476,8 @@ impl Cpu {
             self.set(register, 0);
         }
         let table = self.chip_mut().dual_bank_boot().unwrap_or(BOOT_ALIAS);
-        let sp = self.vector(table).unwrap_or(0) & !3;
-        let entry = self.vector(table + 4).unwrap_or(0);
+        let sp = self.peek(table).unwrap_or(0) & !3;
+        let entry = self.peek(table + 4).unwrap_or(0);
         self.set(R::MSP, sp);
         self.set(R::XPSR_NZCVQG, if entry & 1 != 0 { XPSR_T } else { 0 });
         self.set(R::PC, entry);
@@ -563,14 +563,6 @@ impl Cpu {
             }
             None => false,
         }
-    }
-
-    /// A word of the vector table. The FPB replaces it as a load or as a fetch: the manuals leave it open.
-    fn vector(&self, address: u32) -> Option<u32> {
-        let debug = &self.chip().scs.debug;
-        let mut patches = debug.patches(address, true).chain(debug.patches(address, false));
-        let patch = patches.find(|&(_, at, _)| at == (address % PAGE) as usize);
-        self.peek(patch.map_or(address, |(.., new)| new))
     }
 
     fn peek(&self, address: u32) -> Option<u32> {

@@ -40,16 +40,33 @@ fn board_at(rate: BitRate) -> Bench {
 /// until the device is idle; `look` gets the board between the latter requests. Returns the word of
 /// 1F57h.
 fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) -> u32 {
-    let request = |bench: &mut Bench, data: [u8; 8]| {
-        bench.ask(REQUEST, &data, RESPONSE).unwrap_or_else(|| panic!("no answer to {data:02X?}"))
-    };
-    let idle = |word: &[u8]| u32::from_le_bytes(word[4..].try_into().expect("four bytes"));
+    send(bench, file, usize::MAX);
+    loop {
+        look(bench);
+        assert_eq!(request(bench, READ_1000)[4..], [0, 0, 0, 0x10]);
+        let word = status_word(bench);
+        if word & 1 == 0 {
+            return word;
+        }
+    }
+}
+
+fn request(bench: &mut Bench, data: [u8; 8]) -> Vec<u8> {
+    bench.ask(REQUEST, &data, RESPONSE).unwrap_or_else(|| panic!("no answer to {data:02X?}"))
+}
+
+fn status_word(bench: &mut Bench) -> u32 {
+    u32::from_le_bytes(request(bench, READ_STATUS)[4..].try_into().expect("four bytes"))
+}
+
+/// Sends CLEAR, and so many segments of a file, or all.
+fn send(bench: &mut Bench, file: &[u8], segments: usize) {
     assert_eq!(request(bench, [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0])[0], 0x60);
-    while idle(&request(bench, READ_STATUS)) & 1 != 0 {}
+    while status_word(bench) & 1 != 0 {}
     let [a, b, c, d] = (file.len() as u32).to_le_bytes();
     assert_eq!(request(bench, [0x21, 0x50, 0x1F, 1, a, b, c, d])[0], 0x60);
     let last = file.chunks(7).count() - 1;
-    for (number, segment) in file.chunks(7).enumerate() {
+    for (number, segment) in file.chunks(7).enumerate().take(segments) {
         let mut data = [0; 8];
         data[0] = (number as u8 & 1) << 4 | (7 - segment.len() as u8) << 1 | u8::from(number == last);
         data[1..=segment.len()].copy_from_slice(segment);
@@ -58,14 +75,6 @@ fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) ->
             break;
         }
         assert_eq!(answer[0], 0x20 | (number as u8 & 1) << 4);
-    }
-    loop {
-        look(bench);
-        assert_eq!(request(bench, READ_1000)[4..], [0, 0, 0, 0x10]);
-        let word = idle(&request(bench, READ_STATUS));
-        if word & 1 == 0 {
-            return word;
-        }
     }
 }
 
@@ -330,19 +339,6 @@ fn secrets(file: &[u8]) -> (Traces, Traces) {
     (of_all, Traces::of(&[&stream[..32], &key]))
 }
 
-/// Sends CLEAR and the first half of a file.
-fn send_half(bench: &mut Bench, file: &[u8]) {
-    bench.session().command(1, ProgramControl::Clear).unwrap();
-    bench.run_ms(2_000);
-    let [a, b, c, d] = (file.len() as u32).to_le_bytes();
-    assert_eq!(bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 1, a, b, c, d], RESPONSE).unwrap()[0], 0x60);
-    for (number, segment) in file[..file.len() / 2].chunks_exact(7).enumerate() {
-        let request = [&[(number as u8 & 1) << 4], segment].concat();
-        assert_eq!(bench.ask(REQUEST, &request, RESPONSE).unwrap()[0], 0x20 | (number as u8 & 1) << 4);
-    }
-    bench.run_ms(20);
-}
-
 /// The key-encryption key is only in flash, and the key of an image in RAM while it is installed: RAM can be
 /// read out of a chip with protected flash.
 #[test]
@@ -376,7 +372,8 @@ fn no_secret_outlives_its_use() {
     call_back(&mut bench);
 
     // The same image again erases nothing: after a reset in the middle the program starts at once.
-    send_half(&mut bench, &file);
+    send(&mut bench, &file, file.len() / 14);
+    bench.run_ms(20);
     assert!(of_file.are_left(&bench), "in use");
     bench.machine().reset_pin();
     bench.run_to_first_instruction();
@@ -385,7 +382,8 @@ fn no_secret_outlives_its_use() {
     call_back(&mut bench);
 
     for what in ["an abort by the client", "a reset", "CLEAR"] {
-        send_half(&mut bench, &other);
+        send(&mut bench, &other, other.len() / 14);
+        bench.run_ms(20);
         assert!(of_other.are_left(&bench), "{what}: in use");
         match what {
             "an abort by the client" => bench.post(REQUEST, &[0x80, 0x50, 0x1F, 1, 0, 0, 0, 8]),

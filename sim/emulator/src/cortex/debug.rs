@@ -3,7 +3,7 @@
 //! DebugMonitor exception needs. All of it is in the debug power domain: a reset of the core leaves it
 //! (Cortex-M4 technical reference manual, "Power-on reset" and "System reset").
 //!
-//! **What is missing.** Matches of the DWT's comparators, vector catches.
+//! **What is missing.** Patches of vectors, matches of the DWT's comparators, vector catches.
 
 use crate::memory::PAGE;
 use crate::peripheral::Unmodelled;
