@@ -184,7 +184,17 @@ advice! {
         other: NodeId,
     } => "if node {other} is this device (coflash info --node {other}), its bootloader has another node-ID than its \
           application: run the command again with --node {other}",
-    /// For an application that refuses the call.
+    /// For an application that refuses to leave in its present state.
+    RefusesNow {
+        /// The device.
+        node: NodeId,
+    } => "the application refuses now: stop the machine and run the command again. If it refuses for ever, run coflash catch \
+          --node {node} and switch the device off and on: after a refusal the next start has a rescue window (with a sealed \
+          program after coflash reset --node {node} alone); the entry strap helps, too",
+    /// For an application that does not know the call.
+    UnknownCall => "this application does not know the call (1F51h = 80h): --dialect raw stops it by 1F51h = 0; otherwise \
+                    bring the device into the bootloader by its entry strap, or within its rescue window after power-on",
+    /// For an application that has no way back.
     NoCallBack => "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
                    within its rescue window after power-on",
     /// For a device that does not come back as bootloader.

@@ -87,6 +87,14 @@ pub(super) fn on_page(advice: &Advice) -> String {
                  application: search the bus, and choose node {other}"
             )
         }
+        Advice::RefusesNow { .. } => {
+            "the application refuses now: stop the machine and try again. If it refuses for ever, switch the device off and \
+             on and try again at once: after a refusal the next start has a rescue window; the entry strap helps, too"
+        }
+        Advice::UnknownCall => {
+            "this application does not know the call (1F51h = 80h): bring the device into the bootloader by its entry strap, \
+             or within its rescue window after power-on"
+        }
         Advice::Catch => {
             "switch the device off and on and try again at once; its entry strap holds it in the bootloader, too"
         }

@@ -1,5 +1,6 @@
 //! Which message an error has: what a person at the machine can do about it.
 
+use canopen::AbortCode;
 use coflash_core::device::{Doing, Error};
 use coflash_core::machine::{Bad, DeviceFault, Missing, Outcome};
 use coflash_core::update::DeviceState;
@@ -19,6 +20,7 @@ pub(super) const KEYS: &[&str] = &[
     "trouble-wrong-password",
     "trouble-not-alone",
     "trouble-no-start",
+    "trouble-refuses-now",
     "trouble-renewal",
     "trouble-crc",
     "trouble-other",
@@ -51,6 +53,9 @@ pub(super) fn of_error(error: &Error) -> Message {
         | Error::OtherIdentity { .. }
         | Error::NotInDialect { .. } => "trouble-other-device",
         Error::NotAlone { .. } | Error::Occupied { .. } => "trouble-not-alone",
+        Error::NoBootloader { code: Some(AbortCode::DEVICE_STATE | AbortCode::LOCAL_CONTROL), .. } => {
+            "trouble-refuses-now"
+        }
         Error::NoBootloader { .. }
         | Error::TrialFailed { .. }
         | Error::StartFailed { .. }

@@ -13,6 +13,10 @@ use crate::advice::Advice;
 use crate::device::doing::{Doing, LssDoing};
 use crate::device::state::BootloaderState;
 
+/// An application that refuses with one of these does so in its present state (CiA 301 table 22).
+const DEVICE_STATE: AbortCode = AbortCode::DEVICE_STATE;
+const LOCAL_CONTROL: AbortCode = AbortCode::LOCAL_CONTROL;
+
 impl Error {
     /// What to do next.
     #[must_use]
@@ -65,7 +69,11 @@ impl Error {
             Self::NoBootloader { elsewhere: Some(other), .. } => {
                 Advice::BootloaderElsewhere { other: *other }
             }
-            Self::NoBootloader { code: Some(_), .. } => Advice::NoCallBack,
+            Self::NoBootloader { node, code: Some(DEVICE_STATE | LOCAL_CONTROL), .. }
+            | Self::TrialFailed { node, how: TrialFailure::Stays(Some(DEVICE_STATE | LOCAL_CONTROL)) } => {
+                Advice::RefusesNow { node: *node }
+            }
+            Self::NoBootloader { code: Some(code), .. } => call_advice(*code),
             Self::NoBootloader { .. } => Advice::Catch,
             Self::Lss { doing, failure: LssFailure::NoAnswer } => match doing {
                 LssDoing::Fastscan => Advice::FastscanAgain,
@@ -162,6 +170,18 @@ const fn failure_advice(error: FlashError) -> Advice {
         FlashError::Key => Advice::OtherKey,
         FlashError::Sequence => Advice::Sequence,
         _ => Advice::OnceMore,
+    }
+}
+
+/// The advice for an application that refuses the call to the bootloader, whatever its state.
+fn call_advice(code: AbortCode) -> Advice {
+    match code {
+        AbortCode::INVALID_VALUE => Advice::UnknownCall,
+        AbortCode::NO_OBJECT
+        | AbortCode::NO_SUB_INDEX
+        | AbortCode::READ_ONLY
+        | AbortCode::UNSUPPORTED_ACCESS => Advice::NoCallBack,
+        code => refusal_advice(code),
     }
 }
 

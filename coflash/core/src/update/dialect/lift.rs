@@ -116,7 +116,14 @@ fn unlock_bootloader(
         update.state = DeviceState::Called;
         update.called = Some(LIFT_PROGRAM);
         update.tell(Phase::CallingBack.into());
-        reset_program(session, LIFT_PROGRAM)?;
+        match reset_program(session, LIFT_PROGRAM) {
+            // It knows the command, and does not leave.
+            Err(Error::Refused { node, code, .. }) => {
+                let running = session.device_type()?;
+                return Err(Error::NoBootloader { node, running, code: Some(code), elsewhere: None });
+            }
+            restarted => restarted?,
+        }
         session.talk_to(lift);
         await_lift(session)?;
         update.tell(Note::Moved { node: lift }.into());

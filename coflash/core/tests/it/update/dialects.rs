@@ -76,6 +76,8 @@ struct Lift {
     sub: u8,
     has_control: bool,
     takes: bool,
+    /// The application stays: the lift moves.
+    refuses: bool,
 }
 
 impl Lift {
@@ -89,6 +91,7 @@ impl Lift {
             sub: 1,
             has_control: true,
             takes: true,
+            refuses: false,
         };
         change(&mut lift);
         let mut fake = Fake::new(running);
@@ -134,6 +137,7 @@ impl Maker for Lift {
                 Ok(Deed::Nothing)
             }
             (0x1F51, _) if !self.has_control => Err(NO_OBJECT),
+            (0x1F51, 1) if self.refuses => Err(NOT_NOW),
             (0x1F51, 1) if data == [2] => {
                 let (node, next) = self.restart();
                 Ok(Deed::Restart(node, next))
@@ -180,6 +184,14 @@ fn a_lift_is_unlocked_twice_moves_to_node_126_and_back() {
     // "Reset program", byte for byte.
     let reset = [0x2F, 0x51, 0x1F, 1, 2, 0, 0, 0];
     assert_eq!(fake.sent.iter().filter(|frame| frame.data() == reset).count(), 2);
+}
+
+#[test]
+fn a_lift_that_moves_refuses() {
+    let (mut fake, _) = Lift::fake(APPLICATION, |lift| lift.refuses = true);
+    let error = run_at(&mut fake, NODE, &locked(PHRASE)).0.unwrap_err();
+    assert_eq!(error.number(), 0x6000_0010);
+    assert!(error.advice().to_string().starts_with("the application refuses now"), "{error}");
 }
 
 #[test]

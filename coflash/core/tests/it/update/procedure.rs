@@ -476,6 +476,10 @@ fn a_program_that_fails_its_trial_is_not_released() {
         words.starts_with("it runs in node 5, and refuses the call to the bootloader with abort 06020000h"),
         "{words}"
     );
+    let refuses = Outcome::Abort(0x0800_0022);
+    let (number, _, advice) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, refuses));
+    assert!(number == 0x6000_0010 && advice.starts_with("the application refuses now"), "{advice}");
+    let (.., advice) = trial(&|fake| fake.on_command = script(0x80, usize::MAX, refused));
     // Not --no-trial: that would install what can never be updated.
     assert!(!advice.contains("--no-trial"), "{advice}");
     for words in ["docs/application.md", "coflash reset --node 5", "coflash catch --node 5"] {
@@ -795,12 +799,24 @@ fn an_application_that_does_not_go_back() {
     assert_eq!(error.to_string(), "node 5 stays in an application (device type 00020192h)");
     assert_eq!(fake.writes(), ["command 80"; 3], "nothing was erased");
 
-    let mut fake = Fake::new(APPLICATION);
-    fake.on_command = script(0x80, usize::MAX, Outcome::Abort(0x0602_0000));
-    let error = fails(&mut fake);
-    assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 1));
-    assert!(error.to_string().contains("refuses the call with abort 06020000h"), "{error}");
-    assert!(error.advice().to_string().contains("entry strap"));
+    // The codes as CiA 301 table 22 has them. 06060000h is a confirmation that could not be stored.
+    let refuses = "the application refuses now: stop the machine and run the command again";
+    for (code, words, others) in [
+        (0x0602_0000, "cannot be called back", "entry strap"),
+        (0x0609_0030, "does not know the call", "--dialect raw"),
+        (0x0800_0022, refuses, "run coflash catch --node 5"),
+        (0x0800_0021, refuses, "run coflash catch --node 5"),
+        (0x0606_0000, "run the command again", "the abort code gives the device's reason"),
+        (0x0504_0001, "frames were lost", "second tool"),
+    ] {
+        let mut fake = Fake::new(APPLICATION);
+        fake.on_command = script(0x80, usize::MAX, Outcome::Abort(code));
+        let error = fails(&mut fake);
+        assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 1));
+        assert!(error.to_string().contains(&format!("refuses the call with abort {code:08X}h")), "{error}");
+        let advice = error.advice().to_string();
+        assert!(advice.contains(words) && advice.contains(others), "{advice}");
+    }
 }
 
 #[test]
