@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `main.rs` | wiring of the tasks: put your own beside them |
 //! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
-//! | `objects.rs` | the values of the object dictionary, and the callback `start_bootloader` |
+//! | `objects.rs` | the values of the object dictionary, `may_leave`, and the callback `start_bootloader` |
 //! | `Cargo.toml` | the version of the application |
 //!
 //! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's; 2 is free.
@@ -171,7 +171,7 @@ mod app {
             carry_out(slave, &mut can, now, application);
             let Some(frame) = to_handle.dequeue() else { return };
             if slave.handle(&frame, now, application) {
-                application.control.restart(now.as_millis());
+                application.control.nmt_reset(now.as_millis());
             }
             application.leave_owed(slave);
             if !serves(slave, &mut can, application) {

@@ -1,6 +1,7 @@
 //! The values of the application's object dictionary. The values of 1F51h, 1F56h and 1F57h come
 //! from `coboot-app`, which also decides when the device goes back to its bootloader.
 
+use core::sync::atomic::{AtomicU8, Ordering::SeqCst};
 use core::task::Poll;
 
 use bsp::{line, IDENTITY, LAYOUT};
@@ -42,6 +43,25 @@ static ENTRIES: [Entry; entry_count(NUMBERS)] = entries(NUMBERS).entries();
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
 
+/// What the machine does: it stands, it moves, or it stands because the device leaves. What moves starts
+/// by a `compare_exchange` from `STANDS` to `MOVES`, in whatever task, and not at all if that fails: the
+/// question below and the start exclude each other.
+pub static MACHINE: AtomicU8 = AtomicU8::new(STANDS);
+/// See [`MACHINE`].
+pub const STANDS: u8 = 0;
+/// See [`MACHINE`].
+pub const MOVES: u8 = 1;
+/// See [`MACHINE`].
+pub const LEAVES: u8 = 2;
+
+/// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
+/// command is answered or left to the bootloader: 1F51h = 80h, 0, 2 and 3, and what a sealed program
+/// stores. After a no the command is refused (08000022h), and the program stays. A yes is final: the
+/// reset follows within half a second, and until then the machine does not start.
+fn may_leave() -> bool {
+    MACHINE.compare_exchange(STANDS, LEAVES, SeqCst, SeqCst).is_ok()
+}
+
 /// The application's state that is visible on the bus.
 pub struct Application {
     device: Device,
@@ -78,7 +98,8 @@ impl Application {
             revision,
             serial_number: start.serial_number,
         };
-        let control = ProgramControl::new(start, NUMBERS.programs, BOOTLOADER.program_crc(start.program));
+        let crc = BOOTLOADER.program_crc(start.program);
+        let control = ProgramControl::new(start, NUMBERS.programs, crc).asking(may_leave);
         Self {
             device,
             control,
@@ -104,13 +125,20 @@ impl Application {
 
     /// Advances the departure, if one is in progress.
     pub fn proceed(&mut self, bus_idle: bool) -> Next<BootRequest> {
+        if self.control.leaving() {
+            // An NMT reset did not ask.
+            MACHINE.store(LEAVES, SeqCst);
+        } else {
+            // A command may be refused for another reason after the yes.
+            let _ = MACHINE.compare_exchange(LEAVES, STANDS, SeqCst, SeqCst);
+        }
         self.control.proceed(bus_idle, self.now.as_millis())
     }
 
     /// The path on which the device leaves with this request: an NMT master gets a reset.
     pub fn path(&self, request: BootRequest) -> ReentryPath {
         match request {
-            BootRequest::PowerOn => ReentryPath::SystemReset,
+            BootRequest::PowerOn | BootRequest::Rescue => ReentryPath::SystemReset,
             _ => self.path,
         }
     }
@@ -120,9 +148,8 @@ impl Application {
     ///
     /// It runs before the SDO answer is sent, so it only takes a note: [`proceed`](Self::proceed)
     /// lets the device leave when the answer is on the bus. The first 80h to a program that has just
-    /// been downloaded and started confirms that program instead (`coboot_app::rules`). An
-    /// application that must not leave now, since its machine moves, returns
-    /// `Err(AbortCode::DEVICE_STATE)` first, and stays.
+    /// been downloaded and started confirms that program instead (`coboot_app::rules`). Whether the
+    /// device may leave at all is asked of [`may_leave`], for this command and every other one.
     fn start_bootloader(&mut self, program: u8) -> Result<(), AbortCode> {
         let now = self.now.as_millis();
         Ok(self.control.write_answered(program, &[START_BOOTLOADER], now, &mut self.bootloader)?)

@@ -22,6 +22,14 @@ pub trait Services {
     /// # Errors
     /// The error of the bootloader.
     fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError>;
+
+    /// Takes back that a program is confirmed: it starts with its rescue window.
+    ///
+    /// # Errors
+    /// The error of the bootloader.
+    fn unconfirm(&mut self, _number: u8) -> Result<(), CallgateError> {
+        Err(CallgateError::Absent)
+    }
 }
 
 /// The result of a confirmation.
@@ -48,6 +56,9 @@ impl Confirmed {
         }
     }
 }
+
+/// What is stored in the place of a node-ID for a device that waits for one.
+pub(crate) const NO_NODE_ID: u8 = 255;
 
 /// The bootloader of a board.
 ///
@@ -78,7 +89,6 @@ impl Bootloader {
     /// The error of the bootloader. A sealed device stores these values in the bootloader only, and
     /// only for the holder of a root key.
     pub fn store_node(&self, node_id: Option<u8>, bit_rate: u32) -> Result<(), CallgateError> {
-        const NO_NODE_ID: u8 = 255;
         let node_id = node_id.unwrap_or(NO_NODE_ID).into();
         Callgate::find(self.layout)?.store_node(NodeArgs { node_id, bit_rate })
     }
@@ -102,6 +112,11 @@ impl Services for Bootloader {
     /// Writes flash, as [`Bootloader::store_node`] does.
     fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError> {
         Confirmed::from_outcome(Callgate::find(self.layout)?.confirm(number))
+    }
+
+    /// Writes flash, as [`Bootloader::store_node`] does.
+    fn unconfirm(&mut self, number: u8) -> Result<(), CallgateError> {
+        Callgate::find(self.layout)?.unconfirm(number)
     }
 }
 

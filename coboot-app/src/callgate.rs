@@ -100,6 +100,16 @@ impl<E: Enter> Callgate<E> {
         self.call(Selector::Invalidate, (&raw mut args).cast())
     }
 
+    /// Takes back that a program is confirmed, but not its release.
+    ///
+    /// # Errors
+    /// As for [`confirm`](Self::confirm). [`Status::Locked`] for a sealed program;
+    /// [`Status::UnknownSelector`] of a bootloader that is older than this service.
+    pub fn unconfirm(&self, number: u8) -> Result<(), CallgateError> {
+        let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
+        self.call(Selector::Unconfirm, (&raw mut args).cast())
+    }
+
     fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
         match self.table.entry.enter(selector, args) {
             None => Err(CallgateError::Absent),

@@ -10,22 +10,22 @@
 //! | upload of 1F57h/n | [`flash_status`](ProgramControl::flash_status) | 4 bytes, little-endian |
 //! | upload of 2007h/1 | [`bootloader`](ProgramControl::bootloader) | 1 byte |
 //! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
-//! | NMT reset node | [`restart`](ProgramControl::restart) | |
+//! | NMT reset node | [`nmt_reset`](ProgramControl::nmt_reset) | |
 //!
 //! On a device whose bootloader can be renewed over CAN, that has a sub-index, too: here it is a program that
 //! does not run.
 //!
 //! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
-use shared_abi::callgate::{CallgateError, ProgramArgs, PROGRAM_INSTALLED};
+use shared_abi::callgate::{CallgateError, ProgramArgs, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED};
 use shared_abi::geometry::Region;
 use shared_abi::handoff::SdoBases;
 use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
-use shared_abi::warm_start::{BootRequest, Owed};
+use shared_abi::warm_start::{BootRequest, Owed, StoredNode};
 
 use crate::abort::Abort;
-use crate::bootloader::{Confirmed, Services};
+use crate::bootloader::{Bootloader, Confirmed, Services, NO_NODE_ID};
 use crate::departure::{Departure, Next};
 use crate::rules::{react, Command, Reaction, Standing};
 use crate::start::Start;
@@ -41,6 +41,8 @@ pub const FLASH_STATUS: u16 = 0x1F57;
 /// 2007h: device state, an object of coboot. An application has its sub-index 1 alone.
 pub const DEVICE_STATE: u16 = 0x2007;
 
+/// The callgate cannot store before a reset.
+const LOCKED: i32 = Status::Locked as i32;
 /// The value of 1F51h for a program that is installed and does not run.
 const STOPPED: u8 = 0;
 /// The value of 1F51h for the program that runs.
@@ -78,6 +80,12 @@ pub struct ProgramControl {
     /// The request that a master was promised for the coming reset: the bootloader, or the
     /// confirmation of this program. No other master can replace it.
     promised: Option<BootRequest>,
+    /// The rule of [`asking`](Self::asking).
+    may_leave: fn() -> bool,
+    /// An answer is to be withheld: the departure begins as soon as that is done.
+    withholds: bool,
+    /// The application has refused a master since its start: an NMT reset leaves with this request.
+    refused: Option<BootRequest>,
     /// Node-ID in force.
     node_id: Option<u8>,
     /// The node-ID with which the bootloader can answer in this program's place.
@@ -102,6 +110,9 @@ impl ProgramControl {
             fresh: start.fresh,
             armed: false,
             promised: None,
+            may_leave: || true,
+            withholds: false,
+            refused: None,
             node_id: start.node_id,
             bootloader_node: start.bootloader_node(),
             sdo: start.sdo(),
@@ -116,6 +127,26 @@ impl ProgramControl {
     #[must_use]
     pub const fn answering_itself(self) -> Self {
         Self { bootloader_node: None, ..self }
+    }
+
+    /// With the application's rule about leaving, which is asked once before a command of 1F51h, or a
+    /// request of the application itself, ends in a reset. It answers at once. No: the command is refused
+    /// (08000022h), and nothing is owed. Yes is final: the reset follows, 500 ms later at most, and what
+    /// stands must not start to move while [`leaving`](Self::leaving). An NMT reset does not ask.
+    ///
+    /// So that an application which refuses for ever does not lock itself in, its first refusal of a
+    /// master takes back that it is confirmed: the next start has the rescue window. That writes flash
+    /// as [`Bootloader::store_node`] does. For a sealed program nothing is stored; it has the window
+    /// after an NMT reset.
+    #[must_use]
+    pub const fn asking(self, may_leave: fn() -> bool) -> Self {
+        Self { may_leave, ..self }
+    }
+
+    /// Whether the device is about to leave, until the reset of the chip.
+    #[must_use]
+    pub fn leaving(&self) -> bool {
+        self.withholds || self.departure != Departure::Staying
     }
 
     /// The bases of the COB-IDs of SDO.
@@ -266,6 +297,8 @@ impl ProgramControl {
         answers: Option<u8>,
         services: &mut impl Services,
     ) -> Result<Answer, Abort> {
+        // The command whose answer could not be withheld comes once more, and was permitted.
+        let permitted = core::mem::take(&mut self.withholds);
         if sub == 0 {
             return Err(Abort::READ_ONLY);
         }
@@ -282,9 +315,17 @@ impl ProgramControl {
         }
         let Self { fresh, armed, .. } = *self;
         let standing = Standing { fresh, armed, can_hand_over: answers.is_some() };
-        match react(command, sub == self.program, standing)? {
+        let reaction = react(command, sub == self.program, standing)?;
+        let leaves = matches!(reaction, Reaction::CallBack | Reaction::Restart | Reaction::HandOver);
+        if leaves && !permitted && !self.permits() {
+            return Err(self.refuse(services));
+        }
+        match reaction {
             Reaction::Nothing => {}
-            Reaction::Confirm => self.confirm(now, services)?,
+            Reaction::Confirm => match self.confirm(now, services) {
+                Err(Abort::DEVICE_STATE) if !self.leaving() => return Err(self.refuse(services)),
+                confirmed => confirmed?,
+            },
             Reaction::CallBack => {
                 let request = match (self.promised, command) {
                     (Some(before @ BootRequest::Owed(_)), _) => before,
@@ -298,6 +339,7 @@ impl ProgramControl {
             Reaction::Restart => self.leave(BootRequest::Start(sub), now),
             Reaction::HandOver => {
                 let node_id = answers.unwrap_or(0);
+                self.withholds = true;
                 return Ok(Answer::Withhold(Owed { program: sub, value, node_id }));
             }
         }
@@ -307,37 +349,103 @@ impl ProgramControl {
     /// The answer was withheld ([`Answer::Withhold`]): from now on the device takes and sends
     /// nothing.
     pub fn leave_owed(&mut self, owed: Owed, now: u32) {
+        self.withholds = false;
         self.departure.begin_silent(BootRequest::Owed(owed), now);
     }
 
     /// This program is good: it has heard its master, say, or a master has said so. Where the flash is
-    /// locked (a sealed program) the device restarts to store it. Writes flash
-    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) says how long that takes).
+    /// locked (a sealed program) the device restarts to store it, if it [may leave](Self::asking). Writes
+    /// flash ([`Bootloader::store_node`] says how long that takes). A program that has refused to leave
+    /// since its start is released by this, and keeps its rescue window.
     ///
     /// # Errors
     /// [`Abort::HARDWARE`] where the bootloader did not store it, or there is none;
-    /// [`Abort::DEVICE_STATE`] where the device is about to leave for another reason.
+    /// [`Abort::DEVICE_STATE`] where the device may not leave now, or leaves for another reason.
     pub fn confirm(&mut self, now: u32, services: &mut impl Services) -> Result<(), Abort> {
+        let is_released = |info: ProgramArgs| info.flags & PROGRAM_SIGNED != 0;
+        if self.refused.is_some() && services.program_info(self.program).is_ok_and(is_released) {
+            // There is nothing to store, however often it comes.
+            self.fresh = false;
+            return Ok(());
+        }
         let confirmed = services.confirm(self.program);
         // Until it is stored, an 80h that comes again means the same.
         self.fresh &= confirmed == Ok(Confirmed::AtReset);
         match confirmed {
+            Ok(Confirmed::Now) if self.refused.is_some() => {
+                services.unconfirm(self.program).map_err(|_| Abort::HARDWARE)
+            }
             Ok(Confirmed::Now) => Ok(()),
-            Ok(Confirmed::AtReset) => self.promise(BootRequest::Confirm(self.program), now),
+            Ok(Confirmed::AtReset) => self.restart_with(BootRequest::Confirm(self.program), now),
             Err(_) => Err(Abort::HARDWARE),
         }
     }
 
-    /// An NMT reset node command came. The device restarts as after a power-on, so that the
-    /// bootloader counts no crash. A lift that has its password goes into the bootloader.
-    pub fn restart(&mut self, now: u32) {
-        self.leave(if self.armed { BootRequest::Stay } else { BootRequest::PowerOn }, now);
+    /// [`Bootloader::store_node`] for values that the application itself decides on. Where the flash is
+    /// locked (a sealed program) the device restarts to store them, if it [may leave](Self::asking).
+    ///
+    /// # Errors
+    /// As for [`confirm`](Self::confirm).
+    pub fn store_node(
+        &mut self,
+        node_id: Option<u8>,
+        bit_rate: u32,
+        now: u32,
+        bootloader: &Bootloader,
+    ) -> Result<(), Abort> {
+        let node = StoredNode::new(node_id.unwrap_or(NO_NODE_ID), bit_rate);
+        match bootloader.store_node(node_id, bit_rate) {
+            Err(CallgateError::Refused(LOCKED)) => self.restart_with(BootRequest::StoreNode(node), now),
+            stored => stored.map_err(|_| Abort::HARDWARE),
+        }
+    }
+
+    /// The application itself wants to restart, as after a power-on.
+    ///
+    /// # Errors
+    /// [`Abort::DEVICE_STATE`] where it [may not leave](Self::asking) now.
+    pub fn restart(&mut self, now: u32) -> Result<(), Abort> {
+        self.permits().then(|| self.nmt_reset(now)).ok_or(Abort::DEVICE_STATE)
+    }
+
+    /// An NMT reset node command came, which is not refused (CiA 301). The device restarts as after a
+    /// power-on, so that the bootloader counts no crash. A lift that has its password goes into the
+    /// bootloader.
+    pub fn nmt_reset(&mut self, now: u32) {
+        let request = self.refused.unwrap_or(BootRequest::PowerOn);
+        self.leave(if self.armed { BootRequest::Stay } else { request }, now);
     }
 
     /// Advances the departure. `bus_idle`: no answer waits to be sent, and all frames are on the
     /// bus and were acknowledged. Call it after every frame and every few milliseconds.
     pub fn proceed(&mut self, bus_idle: bool, now: u32) -> Next<BootRequest> {
         self.departure.proceed(bus_idle, now)
+    }
+
+    /// The answer of the application. A device that is leaving is not asked again.
+    fn permits(&self) -> bool {
+        self.leaving() || (self.may_leave)()
+    }
+
+    /// The refusal of a master. The next start has the rescue window. That is stored once since the
+    /// start: whoever asks for ever wears nothing out.
+    fn refuse(&mut self, services: &mut impl Services) -> Abort {
+        if self.refused != Some(BootRequest::Rescue) {
+            let known = services.unconfirm(self.program);
+            // A bootloader without this service would take the request for a crash.
+            let is_known = matches!(known, Ok(()) | Err(CallgateError::Refused(LOCKED)));
+            self.refused = Some(if is_known { BootRequest::Rescue } else { BootRequest::PowerOn });
+        }
+        Abort::DEVICE_STATE
+    }
+
+    /// The device restarts to store something, if the application permits it.
+    fn restart_with(&mut self, request: BootRequest, now: u32) -> Result<(), Abort> {
+        if self.permits() {
+            self.promise(request, now)
+        } else {
+            Err(Abort::DEVICE_STATE)
+        }
     }
 
     /// The device leaves with this request, unless it was promised to leave with another one.
@@ -351,7 +459,7 @@ impl ProgramControl {
     }
 
     fn leave(&mut self, request: BootRequest, now: u32) {
-        let promised = !matches!(request, BootRequest::PowerOn | BootRequest::Start(_));
+        let promised = !matches!(request, BootRequest::PowerOn | BootRequest::Rescue | BootRequest::Start(_));
         self.departure.begin(request, promised, now);
     }
 
@@ -378,13 +486,21 @@ mod tests {
     struct Fake {
         confirm: Result<Confirmed, CallgateError>,
         confirmed: usize,
+        /// What it says when the confirmation is taken back, and how often that came.
+        unconfirm: Result<(), CallgateError>,
+        unconfirmed: usize,
     }
 
-    const STORES: Fake = Fake { confirm: Ok(Confirmed::Now), confirmed: 0 };
+    const STORES: Fake =
+        Fake { confirm: Ok(Confirmed::Now), confirmed: 0, unconfirm: Ok(()), unconfirmed: 0 };
+    /// That of a sealed program: the flash is locked.
+    const LOCKS: Fake =
+        Fake { confirm: Ok(Confirmed::AtReset), unconfirm: Err(CallgateError::Refused(-8)), ..STORES };
 
     impl Services for Fake {
         fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
             match number {
+                1 if self.confirmed > 0 => Ok(ProgramArgs { flags: 3, ..ProgramArgs::default() }),
                 2 => Ok(ProgramArgs { crc: 0x1122_3344, flags: 1, ..ProgramArgs::default() }),
                 _ => Err(CallgateError::Refused(-7)),
             }
@@ -392,8 +508,14 @@ mod tests {
 
         fn confirm(&mut self, number: u8) -> Result<Confirmed, CallgateError> {
             assert_eq!(number, 1);
-            self.confirmed += 1;
+            self.confirmed += usize::from(self.confirm != Ok(Confirmed::AtReset));
             self.confirm
+        }
+
+        fn unconfirm(&mut self, number: u8) -> Result<(), CallgateError> {
+            assert_eq!(number, 1);
+            self.unconfirmed += 1;
+            self.unconfirm
         }
     }
 
@@ -559,7 +681,7 @@ mod tests {
     #[test]
     fn a_confirmation_that_fails_is_told_and_the_next_80h_calls_the_bootloader() {
         let mut control = control(true);
-        let mut fails = Fake { confirm: Err(CallgateError::Absent), confirmed: 0 };
+        let mut fails = Fake { confirm: Err(CallgateError::Absent), ..STORES };
         assert_eq!(control.write(1, &[0x80], 0, &mut fails), Err(Abort(0x0606_0000)));
         assert_eq!(request_behind(&mut control), Next::Serve);
         assert_eq!(control.write(1, &[0x80], 300, &mut fails), Ok(Answer::Send));
@@ -571,24 +693,86 @@ mod tests {
     #[test]
     fn a_confirmation_at_the_reset_is_kept_against_other_commands() {
         let mut control = control(true);
-        let mut locked = Fake { confirm: Ok(Confirmed::AtReset), confirmed: 0 };
+        let mut locked = LOCKS;
         assert_eq!(control.write(1, &[0x80], 0, &mut locked), Ok(Answer::Send));
         assert_eq!(control.write(1, &[0x80], 1, &mut locked), Ok(Answer::Send), "the same again");
         for value in [0, 2, 3] {
             assert_eq!(control.write(1, &[value], 2, &mut locked), Err(STATE), "{value}");
         }
-        control.restart(3);
+        control.nmt_reset(3);
         assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Confirm(1)));
+    }
+
+    /// Nothing has happened after a no, and nothing is owed, however often a master asks; an NMT reset is
+    /// not refused (CiA 301). A bootloader that is older than the rescue request would count a crash.
+    #[test]
+    fn an_application_that_may_not_leave_stays_and_gets_the_rescue_window() {
+        let refused = |code| Err(CallgateError::Refused(code));
+        for (answer, times, request) in [
+            (Ok(()), 1, BootRequest::Rescue),
+            (refused(-8), 1, BootRequest::Rescue),
+            (refused(-1), 1000, BootRequest::PowerOn),
+            (Err(CallgateError::Absent), 1000, BootRequest::PowerOn),
+        ] {
+            for (sub, value) in [(1, 0x80), (2, 0x80), (1, 0), (2, 0), (1, 2), (1, 3), (2, 3)] {
+                let mut control = control(false).asking(|| false);
+                let mut services = Fake { unconfirm: answer, ..STORES };
+                for _ in 0..1000 {
+                    assert_eq!(control.write(sub, &[value], 0, &mut services), Err(STATE), "{value}");
+                }
+                assert_eq!((control.leaving(), services.unconfirmed), (false, times), "{value} {answer:?}");
+                assert_eq!(request_behind(&mut control), Next::Serve);
+                control.nmt_reset(0);
+                assert!(control.leaving());
+                assert_eq!(request_behind(&mut control), Next::Leave(request), "{answer:?}");
+            }
+        }
+        // What the application itself wants locks nobody out.
+        let (mut sealed, mut locks) = (control(true).asking(|| false), LOCKS);
+        assert_eq!((sealed.confirm(0, &mut locks), sealed.restart(0)), (Err(STATE), Err(STATE)));
+        assert_eq!((sealed.refused, locks.unconfirmed), (None, 0));
+        assert_eq!(sealed.write(1, &[0x80], 0, &mut locks), Err(STATE), "it needs a reset");
+        assert_eq!((request_behind(&mut sealed), locks.unconfirmed), (Next::Serve, 1));
+        sealed.may_leave = || true;
+        assert_eq!(sealed.write(1, &[0x80], 0, &mut locks), Ok(Answer::Send), "it still confirms");
+        assert_eq!(request_behind(&mut sealed), Next::Leave(BootRequest::Confirm(1)));
+        // A confirmation after the refusal releases the program, and the window stays.
+        let (mut fresh, mut services) = (control(true).asking(|| false), STORES);
+        assert_eq!(fresh.write(1, &[2], 0, &mut services), Err(STATE));
+        for _ in 0..1000 {
+            assert_eq!(fresh.confirm(0, &mut services), Ok(()));
+        }
+        assert_eq!((services.confirmed, services.unconfirmed), (1, 2));
+    }
+
+    /// It is asked once, before an answer is withheld. Where the client wrote in segments the answer cannot
+    /// be: STOP is a call then, and a CLEAR that is refused takes the yes back.
+    #[test]
+    fn a_yes_is_final() {
+        for value in [0x80, 0, 2, 3] {
+            let mut control = control(false).asking(|| true);
+            let answer = control.write(1, &[value], 0, &mut { STORES }).unwrap();
+            assert!(control.leaving(), "{value}");
+            control.may_leave = || panic!("it was asked again");
+            if let Answer::Withhold(owed) = answer {
+                let mut in_segments = control.clone();
+                let taken = in_segments.write_answered(1, &[value], 0, &mut { STORES });
+                assert_eq!((taken.is_ok(), in_segments.leaving()), (value == 0, value == 0), "{value}");
+                control.leave_owed(owed, 0);
+            }
+            assert!(control.write(1, &[0x80], 5, &mut { STORES }).is_ok());
+            assert!(matches!(request_behind(&mut control), Next::Leave(_)) && control.leaving());
+        }
     }
 
     #[test]
     fn a_restart_counts_as_no_crash_and_an_armed_lift_goes_to_the_bootloader() {
         let mut control_of_lift = control(false).answering_itself();
         control_of_lift.arm();
-        control_of_lift.restart(0);
+        control_of_lift.nmt_reset(0);
         assert_eq!(request_behind(&mut control_of_lift), Next::Leave(BootRequest::Stay));
         let mut plain = control(false);
-        plain.restart(0);
+        assert_eq!(plain.restart(0), Ok(()));
         assert_eq!(request_behind(&mut plain), Next::Leave(BootRequest::PowerOn));
         let mut again = control(false);
         assert_eq!(again.write(1, &[2], 0, &mut { STORES }), Ok(Answer::Send));

@@ -183,6 +183,13 @@ impl Responder {
         &mut self.control
     }
 
+    /// Whether the device is about to leave ([`ProgramControl::leaving`]): what stands must not start to
+    /// move.
+    #[must_use]
+    pub fn leaving(&self) -> bool {
+        self.control.leaving()
+    }
+
     /// Whether an NMT master has started the node: it is OPERATIONAL.
     #[must_use]
     pub fn is_operational(&self) -> bool {
@@ -247,7 +254,7 @@ impl Responder {
             0x01 => Nmt::Operational,
             0x02 => Nmt::Stopped,
             0x80 => Nmt::PreOperational,
-            0x81 => return self.control.restart(now),
+            0x81 => return self.control.nmt_reset(now),
             0x82 => Nmt::BootUp,
             _ => return,
         };
@@ -731,9 +738,14 @@ mod tests {
     #[test]
     fn stop_is_left_to_the_bootloader_and_the_device_is_silent() {
         let mut responder = responder();
+        let mut stays =
+            Responder { control: responder.control.clone().asking(|| false), ..responder.clone() };
+        let refused = Some([0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 8]);
+        assert_eq!(ask(&mut stays, [0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]), refused);
+        assert_eq!((stays.proceed(true, 1), stays.leaving()), (Next::Serve, false));
         assert_eq!(ask(&mut responder, [0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]), None);
         assert_eq!(ask(&mut responder, [0x40, 0, 0x10, 0, 0, 0, 0, 0]), None);
-        assert_eq!(responder.poll(1000), None);
+        assert!(responder.leaving() && responder.poll(1000).is_none());
         let owed = Owed { program: 1, value: 0, node_id: 5 };
         assert_eq!(responder.proceed(true, 1), Next::Leave(BootRequest::Owed(owed)));
     }

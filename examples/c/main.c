@@ -61,13 +61,21 @@ const struct object objects[] = {
 
 /* ---- Program control ---- */
 
+/* Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
+ * command is answered: 1F51h = 80h, 0, 2 and 3. A machine that moves answers false, and the command is
+ * refused. After true the reset follows within half a second: until then nothing may start to move that
+ * stands (coboot_program_leaving).
+ */
+static bool may_leave(void)
+{
+    return true;
+}
+
 /* 1F51h = 80h: a master calls the bootloader in the place of the program `sub`.
  *
  * It only takes a note. coboot_program_proceed resets the chip when the answer is on the bus and some
  * 10 ms have passed, so nothing has to wait here, as the manual's TgtStartBootloader does. The first
- * 80h to a program that has just been downloaded and started confirms that program instead. An
- * application that must not leave now, since its machine moves, returns COBOOT_ABORT_DEVICE_STATE
- * first, and stays.
+ * 80h to a program that has just been downloaded and started confirms that program instead.
  */
 static uint32_t start_bootloader(uint8_t sub)
 {
@@ -112,7 +120,7 @@ static void nmt(const struct can_frame *frame)
         break;
     case RESET_NODE:
     case RESET_COMMUNICATION: /* There is little to reset: both go through a reset. */
-        coboot_program_restart(&program, board_now_ms());
+        coboot_program_nmt_reset(&program, board_now_ms());
         break;
     default:
         break;
@@ -165,6 +173,7 @@ static void start_can(uint32_t clock)
 int main(void)
 {
     coboot_program_init(&program, DEFAULT_NODE_ID, DEFAULT_BIT_RATE);
+    program.may_leave = may_leave;
     if (program.nameplate != NULL) {
         identity[1] = program.nameplate->vendor_id;
         identity[2] = program.nameplate->product_code;

@@ -13,8 +13,15 @@ COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);
 // What coboot knows of this program.
 coboot_program program;
 
-// The callback of a download to 1F51h, before it is answered: 80h calls the bootloader. A machine that moves refuses 80h by
-// COBOOT_ABORT_DEVICE_STATE, and stays in the program.
+// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a command is answered: 1F51h = 80h,
+// 0, 2 and 3. A machine that moves answers false, and the command is refused. After true the reset follows within half a second:
+// until then nothing may start to move that stands (coboot_program_leaving).
+static bool may_leave()
+{
+    return true;
+}
+
+// The callback of a download to 1F51h, before it is answered.
 uint32_t app_cb_program_ctrl(uint8_t sub, uint32_t value)
 {
     return coboot_program_write(&program, COBOOT_PROGRAM_CONTROL, sub, value, board_now_ms());
@@ -109,7 +116,7 @@ private:
             break;
         case 129: // Reset node, reset communication: there is little to reset, so both go through a reset.
         case 130:
-            coboot_program_restart(&program, board_now_ms());
+            coboot_program_nmt_reset(&program, board_now_ms());
             break;
         default:
             break;
@@ -157,6 +164,7 @@ const object objects[] = {
 extern "C" int main()
 {
     coboot_program_init(&program, DEFAULT_NODE_ID, DEFAULT_BIT_RATE);
+    program.may_leave = may_leave;
     if (program.nameplate != nullptr) {
         identity[1] = program.nameplate->vendor_id;
         identity[2] = program.nameplate->product_code;

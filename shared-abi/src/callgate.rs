@@ -58,6 +58,11 @@ pub enum Selector {
     /// Withdraws a program's release for autostart, like 1F51h = 84h. Takes [`ProgramArgs`] and
     /// only uses the number.
     Invalidate = 6,
+    /// Takes back that a program is confirmed, but not its release: it starts with its rescue window
+    /// until it has shown again that it can return. Takes [`ProgramArgs`] and only uses the number.
+    /// That of a sealed program is not stored ([`Status::Locked`]): its confirmation keeps older
+    /// images out, and no stranger may wear the flash out.
+    Unconfirm = 7,
 }
 
 impl Selector {
@@ -71,6 +76,7 @@ impl Selector {
             4 => Self::ProgramInfo,
             5 => Self::Confirm,
             6 => Self::Invalidate,
+            7 => Self::Unconfirm,
             _ => return None,
         })
     }
@@ -99,7 +105,8 @@ pub enum Status {
     /// Storing is not possible before the next reset, because the flash is locked for a sealed
     /// program. Put the same request into the warm-start cell instead
     /// ([`BootRequest::Confirm`](crate::warm_start::BootRequest::Confirm) and the two requests
-    /// after it).
+    /// after it; [`BootRequest::Rescue`](crate::warm_start::BootRequest::Rescue) for
+    /// [`Selector::Unconfirm`]).
     Locked = -8,
     /// The journal is nearly full, and its last places are for confirmations; or these are used, too. The next
     /// start without a request makes room, and so does the bootloader when it is called.

@@ -92,6 +92,9 @@ pub enum BootRequest {
     /// bootloader writes this request itself, in a product that permits it; another one starts as after a
     /// power-on.
     RomLoader = 14,
+    /// Start as after a power-on, with the rescue window of a program that was never confirmed: the
+    /// program has refused to leave for the bootloader, and NMT reset node came.
+    Rescue = 15,
 }
 
 /// A step in the trial of a new RAM image.
@@ -170,8 +173,8 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the ROM; 0
-    /// none, which may have the mark.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the ROM,
+    /// 15 as after a power-on with a rescue window; 0 none, which may have the mark.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
@@ -212,6 +215,7 @@ impl WarmStart {
             }
             BootRequest::Renewal(step) => (13, step as u32),
             BootRequest::RomLoader => (14, 0),
+            BootRequest::Rescue => (15, 0),
         };
         Self::encode(request, argument)
     }
@@ -248,6 +252,7 @@ impl WarmStart {
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
             (13, ..=0xFF) => BootRequest::Renewal(TrialStep::from_number(program)?),
             (14, 0) => BootRequest::RomLoader,
+            (15, 0) => BootRequest::Rescue,
             _ => return None,
         })
     }
@@ -347,6 +352,7 @@ mod tests {
             BootRequest::Renewal(TrialStep::Late),
             BootRequest::Renewal(TrialStep::GivenUp),
             BootRequest::RomLoader,
+            BootRequest::Rescue,
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;

@@ -189,7 +189,7 @@ int call(void)
     uint32_t crc;
     return coboot_read_handoff(&handoff) && coboot_nameplate(&handoff) == NULL && coboot_crc32(gate, 0, 4, &crc) == 0 && coboot_read_node(gate, &node) == 0
         && coboot_store_node(gate, 1, 125000) == 0 && coboot_program_info(gate, 1, &program) == 0
-        && coboot_confirm(gate, 1) == 0 && coboot_invalidate(gate, 1) == 0;
+        && coboot_confirm(gate, 1) == 0 && coboot_invalidate(gate, 1) == 0 && coboot_unconfirm(gate, 1) == 0;
 }
 
 void leave(void)

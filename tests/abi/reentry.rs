@@ -46,8 +46,8 @@ int main(int count, char **words)
 }
 "#;
 
-/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store node.
-const REQUESTS: [u32; 6] = [1, 3, 5, 7, 10, 12];
+/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store node, rescue.
+const REQUESTS: [u32; 7] = [1, 3, 5, 7, 10, 12, 15];
 const OWED: u32 = 7;
 const CONFIRM: u32 = 10;
 
@@ -71,7 +71,7 @@ impl Model {
             departure.begin_silent(request, now);
             self.silent = true;
         } else {
-            departure.begin(request, !matches!(request, 3 | 5), now);
+            departure.begin(request, !matches!(request, 3 | 5 | 15), now);
         }
         self.confirms |= request == CONFIRM;
         true

@@ -48,7 +48,9 @@ enum {
     PLAIN_CALL = 14,
     /* How long the last of these calls took, in cycles of the core. */
     CYCLES = 15,
-    LAST = CYCLES,
+    /* 1: the machine of this program moves, so the device may not leave. */
+    MOVES = 16,
+    LAST = MOVES,
 };
 
 extern uint32_t __bss_end;
@@ -151,6 +153,17 @@ static uint32_t set(uint8_t sub, uint32_t value)
     return COBOOT_ABORT_NONE;
 }
 
+static bool stands(void)
+{
+    return values[MOVES] == 0;
+}
+
+static uint32_t move(uint8_t sub, uint32_t value)
+{
+    program.may_leave = stands;
+    return set(sub, value);
+}
+
 static uint32_t open_flash(uint8_t sub, uint32_t value)
 {
     if (value == 0) {
@@ -179,5 +192,6 @@ const struct object more_objects[] = {
     { 0x2100, SP, 4, &values[SP], NULL },
     { 0x2100, PLAIN_CALL, 4, &values[PLAIN_CALL], plain_call },
     { 0x2100, CYCLES, 4, &values[CYCLES], NULL },
+    { 0x2100, MOVES, 4, &values[MOVES], move },
     { 0 },
 };

@@ -31,6 +31,7 @@ const STORE_NODE: u32 = 3;
 const PROGRAM_INFO: u32 = 4;
 const CONFIRM: u32 = 5;
 const INVALIDATE: u32 = 6;
+const UNCONFIRM: u32 = 7;
 const OK: i32 = 0;
 const UNKNOWN_SELECTOR: i32 = -1;
 const BAD_POINTER: i32 = -2;
@@ -96,9 +97,7 @@ fn put(bench: &mut Bench, at: Address, value: u32) {
 }
 
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     bench.events();
 }
@@ -396,7 +395,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
     let ram = layout.chip.sram;
     let before = bench.machine().flash().to_vec();
     let good = number(&mut bench, probe::ADDRESS);
-    for selector in [0, 7, 8, 0x7FFF_FFFF, 0x8000_0001, u32::MAX] {
+    for selector in [0, 8, 9, 0x7FFF_FFFF, 0x8000_0001, u32::MAX] {
         // The selector is looked at first: no pointer makes another one of it.
         for pointer in [good, 0] {
             assert_eq!(
@@ -422,7 +421,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
         0xFFFF_FFFC,
         u32::MAX,
     ];
-    for selector in [CRC32, READ_NODE, STORE_NODE, PROGRAM_INFO, CONFIRM, INVALIDATE] {
+    for selector in [CRC32, READ_NODE, STORE_NODE, PROGRAM_INFO, CONFIRM, INVALIDATE, UNCONFIRM] {
         for pointer in pointers {
             let status = call_with(&mut bench, selector, pointer, [1; 5]).status;
             assert_eq!(status, BAD_POINTER, "{selector}, {pointer:#x}");
@@ -460,7 +459,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
         let called = call(&mut bench, STORE_NODE, [node[0], node[1], 3, 4, 5]);
         assert_eq!(called.status, BAD_ARGUMENT, "{node:?}");
     }
-    for selector in [PROGRAM_INFO, CONFIRM, INVALIDATE] {
+    for selector in [PROGRAM_INFO, CONFIRM, INVALIDATE, UNCONFIRM] {
         let absent = layout.programs.len() as u32 + 1;
         for program in [0, absent, 254, 255, 256, 257, u32::MAX] {
             let status = call(&mut bench, selector, [program; 5]).status;
@@ -478,6 +477,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
         (PROGRAM_INFO, [1; 5]),
         (CONFIRM, [1; 5]),
         (INVALIDATE, [1; 5]),
+        (UNCONFIRM, [1; 5]),
     ] {
         let called = call(&mut bench, selector, words);
         assert_eq!((called.status, called.words), (BUSY, words), "{selector}");
@@ -568,6 +568,10 @@ fn a_trial_confirms_itself_and_takes_it_back() {
     assert_eq!(call(&mut bench, CONFIRM, [1; 5]).status, OK);
     power_cycle(&mut bench);
     assert!(!bench.is_bootloader(NODE), "it had");
+    for _ in 0..2 {
+        assert_eq!(call(&mut bench, UNCONFIRM, [1; 5]).status, OK);
+        assert_eq!(call(&mut bench, PROGRAM_INFO, [1; 5]).words[4], 0b11, "still signed");
+    }
     assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
     power_cycle(&mut bench);
     assert!(bench.is_bootloader(NODE), "it has taken that back");
@@ -625,7 +629,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
         program_of(elf(firmware::APP_C_PROBE), &Options::default().region(strict(1))).unwrap().program;
     flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
-    for selector in [CONFIRM, INVALIDATE] {
+    for selector in [CONFIRM, INVALIDATE, UNCONFIRM] {
         assert_eq!(call(&mut bench, selector, [2; 5]).status, NO_PROGRAM);
     }
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();

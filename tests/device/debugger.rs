@@ -39,9 +39,7 @@ const DEVICE_STATE: Option<u32> = Some(0x0800_0022);
 
 /// A board with a bootloader that has the interface.
 fn bootloader() -> Bench {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_DEBUGGER);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_DEBUGGER).switched_on();
     // The emergency after the boot-up message.
     bench.run_ms(10);
     bench
@@ -49,9 +47,7 @@ fn bootloader() -> Bench {
 
 /// A board with an application that has the interface, and a standard bootloader.
 fn application() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let file = firmware::blocks(firmware::APP_DEBUGGER);
     flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.confirm_program();
@@ -61,10 +57,7 @@ fn application() -> Bench {
 
 /// The address of a symbol of the application.
 fn symbol(name: &str) -> u32 {
-    let elf = firmware::elf(firmware::APP_DEBUGGER);
-    let file = object::File::parse(&*elf).unwrap();
-    let symbol = file.symbol_by_name(name).unwrap_or_else(|| panic!("no symbol {name}"));
-    symbol.address() as u32 & !1
+    firmware::symbol(firmware::APP_DEBUGGER, |of| of == name)
 }
 
 fn code(outcome: Result<(), Error>) -> Option<u32> {
@@ -311,9 +304,7 @@ fn the_scripts_of_the_document_are_played() {
 /// The standard images do not have this object.
 #[test]
 fn without_the_feature_there_is_no_interface() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
     bench.install(firmware::APP_V1);
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
@@ -701,9 +692,7 @@ fn coflash_debug_tells_what_a_device_lacks() {
     endpoint.bench.machine().set_read_protection(0);
     let (code, _, err) = debug(&mut endpoint, &["read", "0x20000000"]);
     assert!(code == Some(6) && err.contains("the device is secured"), "{err}");
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let (code, _, err) = debug(&mut Endpoint::new(bench), &["read", "0x20000000"]);
     assert!(code == Some(6) && err.contains("no debugger interface"), "{err}");
 }

@@ -12,7 +12,7 @@ use coboot_tests::bench::{
 use coboot_tests::{firmware, renewal};
 use coflash_core::device::info::info;
 use coflash_core::update::steps::call_back;
-use coflash_core::update::{flash, FlashOptions};
+use coflash_core::update::{catch, flash, CatchOptions, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::Stop;
 use emulator::time::{Span, Time};
@@ -21,9 +21,7 @@ use shared_abi::renewal::Progress;
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 
 fn running_board(image: &str) -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
     bench.run_ms(100);
     bench.events();
@@ -41,12 +39,6 @@ fn reset(bench: &mut Bench) -> Time {
 fn answers(bench: &Bench, from: Time) -> Vec<(Time, [u8; 8])> {
     let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE);
     frames.map(|(at, _, data)| (at, data.try_into().expect("8 bytes"))).collect()
-}
-
-fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
 }
 
 /// All kinds of requests during the 10 ms between the answer and the reset are answered; frames
@@ -205,6 +197,49 @@ fn what_the_application_can_refuse_it_refuses_itself() {
     }
 }
 
+/// A machine that moves (08000022h, CiA 301 table 22): every command that would end in a reset is refused,
+/// and stores one value however often it comes. So that an application which refuses for ever does not
+/// lock itself in, the next start has the rescue window, by an NMT reset as after a power-off.
+#[test]
+fn an_application_that_may_not_leave_stays_and_can_be_caught() {
+    let nmt_reset: fn(&mut Bench) = |bench| bench.post(0, &[0x81, NODE]);
+    let refused = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
+    for image in [firmware::APP_V1, firmware::APP_C_PROBE] {
+        let mut bench = fresh_board(image);
+        assert!(bench.ask(REQUEST, &control(0x80), RESPONSE).is_some());
+        assert_eq!(bench.boot_ups(nmt_reset), 1, "{image}: confirmed by the first 80h");
+        for start in [nmt_reset, Bench::power_cycle] {
+            bench.move_machine(image, true);
+            assert_eq!(bench.ask(REQUEST, &control(0), RESPONSE).as_deref(), Some(&refused[..]), "{image}");
+            let stored = bench.machine().flash().to_vec();
+            for value in [0x80, 0x00, 0x02, 0x03].repeat(10) {
+                let answer = bench.ask(REQUEST, &control(value), RESPONSE);
+                assert_eq!(answer.as_deref(), Some(&refused[..]), "{image} {value}");
+            }
+            bench.run_ms(700);
+            assert!(!bench.is_bootloader(NODE) && bench.machine().flash() == stored, "{image}");
+            assert_eq!(bench.boot_ups(start), 2, "{image}: the bootloader, and the program");
+        }
+        if image == firmware::APP_V1 {
+            // STOP in segments, which the server in C has not.
+            bench.move_machine(image, true);
+            bench.ask(REQUEST, &[0x21, 0x51, 0x1F, 1, 1, 0, 0, 0], RESPONSE);
+            let end = bench.ask(REQUEST, &[0x0D, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
+            assert_eq!(end.as_deref(), Some(&refused[..]));
+        }
+        bench.power_cycle();
+        let caught = catch(&mut bench.session(), &CatchOptions::default(), &mut |_| {}).unwrap();
+        assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{image}");
+        // Its program is as it was, and leaves when its machine stands: it is confirmed again.
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_boot_up(1000);
+        bench.run_ms(20);
+        bench.confirm_program();
+        bench.run_ms(50);
+        assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "{image}");
+    }
+}
+
 /// CLEAR in the application is CLEAR in the bootloader: a refusal also comes from the bootloader.
 /// Here 1F50h is locked by a password (ESAcademy).
 #[test]
@@ -310,9 +345,7 @@ fn raw_download(bench: &mut Bench, node: u8, image: &str) {
 
 /// A board with a program that was downloaded in one transfer and started.
 fn fresh_board(image: &str) -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     raw_download(&mut bench, NODE, image);
     bench.session().command(1, ProgramControl::Start).unwrap();
@@ -340,28 +373,6 @@ fn the_first_80h_to_a_fresh_program_confirms_it() {
     }
 }
 
-/// A confirmation by 80h is permanent: the program starts without a rescue window.
-#[test]
-fn a_program_that_80h_has_confirmed_has_no_rescue_window() {
-    for image in APPLICATIONS {
-        for confirm in [false, true] {
-            let mut bench = fresh_board(image);
-            if confirm {
-                assert!(bench.ask(REQUEST, &control(0x80), RESPONSE).is_some());
-            }
-            bench.run_ms(50);
-            bench.power_off();
-            bench.run_ms(100);
-            let from = bench.time();
-            bench.power_on();
-            bench.run_ms(RESCUE_WINDOW_MS + 200);
-            let boot_ups = bench.frames_since(from);
-            let boot_ups = boot_ups.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]);
-            assert_eq!(boot_ups.count(), if confirm { 1 } else { 2 }, "{image}");
-        }
-    }
-}
-
 /// A program is fresh if it was started directly after its download: not after a power-off, an NMT
 /// reset or a restart by 2, not in a trial run of block files, not after a release by 83h.
 #[test]
@@ -369,7 +380,7 @@ fn every_other_80h_is_a_call() {
     type Step = fn(&mut Bench);
     let between: [(&str, Step); 3] = [
         ("power-off", |bench| {
-            power_cycle(bench);
+            bench.power_cycle();
             bench.await_program(1000);
         }),
         ("NMT reset node", |bench| {
@@ -392,9 +403,7 @@ fn every_other_80h_is_a_call() {
             assert!(bench.is_bootloader(NODE), "{image}, {what}");
         }
         // A trial run of our own dialect: blocks, START, 80h, release.
-        let mut bench = Bench::new();
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::new().switched_on();
         let options = FlashOptions::default().watch(Some(Duration::ZERO));
         let began = bench.time();
         flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
@@ -484,7 +493,7 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
             assert_eq!(read(&mut bench, PROGRAM_ID, 1), 0, "after {after}");
             assert_eq!(read(&mut bench, PROGRAM_CONTROL, 1), 3, "after {after}");
             assert_eq!(read(&mut bench, 0x2007, 2), reason, "after {after}");
-            power_cycle(&mut bench);
+            bench.power_cycle();
         }
         bench.await_boot_up(1000);
         // A new download brings everything back.

@@ -2,7 +2,7 @@
 
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
-use coboot_tests::bench::{Bench, NODE, RESCUE_WINDOW_MS};
+use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{call_back, firmware};
 use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
@@ -34,9 +34,7 @@ fn running_board() -> Bench {
 }
 
 fn running_board_with(silicon: Silicon) -> Bench {
-    let mut bench = Bench::with(Options { silicon, ..Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::with(Options { silicon, ..Options::default() }).switched_on();
     install(&mut bench, NODE, firmware::APP_V1);
     bench.confirm_program();
     bench.events();
@@ -48,9 +46,7 @@ fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
 }
 
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     bench.events();
 }
@@ -167,35 +163,6 @@ fn the_answer_comes_before_the_departure_at_every_bit_rate() {
     call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
-/// A program without a release is on trial: it confirms itself, or the device stays in the
-/// bootloader after the next reset.
-#[test]
-fn a_trial_confirms_itself_through_the_callgate() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    let options = FlashOptions::default().start(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.run_ms(550);
-    assert!(!bench.is_bootloader(NODE));
-    assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED);
-    power_cycle(&mut bench);
-    assert!(bench.is_bootloader(NODE), "it had not confirmed itself");
-
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
-    write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
-    assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED | SIGNED);
-    power_cycle(&mut bench);
-    assert!(!bench.is_bootloader(NODE), "it had");
-
-    write(&mut bench, CONFIRMATION, 0).unwrap();
-    assert!(write(&mut bench, CONFIRMATION, 4).is_err());
-    power_cycle(&mut bench);
-    assert!(bench.is_bootloader(NODE), "it has taken that back");
-}
-
 /// Sets another node-ID and optionally another bit rate of a node by layer setting services (CiA
 /// 305), and stores them.
 fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
@@ -205,9 +172,7 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
         let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
         assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
     }
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
 }
 
 /// Node-ID and bit rate set in the application also apply in the bootloader, and the other way
@@ -215,9 +180,7 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
 #[test]
 fn node_id_and_bit_rate_are_shared() {
     for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
-        let mut bench = Bench::of_image(bootloader);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(bootloader).switched_on();
         install(&mut bench, NODE, firmware::APP_V1);
         let serial = bench.session().read_number(Address::new(0x1018, 4)).unwrap();
 
@@ -313,27 +276,22 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
 /// new program again.
 #[test]
 fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
-    let boot_ups = |bench: &mut Bench| {
-        bench.power_off();
-        bench.run_ms(100);
-        let from = bench.time();
-        bench.power_on();
-        bench.run_ms(RESCUE_WINDOW_MS + 200);
-        let id = 0x700 + u32::from(NODE);
-        bench.frames_since(from).iter().filter(|(_, of, data)| *of == id && data[..] == [0]).count()
-    };
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     install(&mut bench, NODE, firmware::APP_V1);
-    assert_eq!(boot_ups(&mut bench), 2, "the bootloader's, then the program's");
-    assert_eq!(boot_ups(&mut bench), 2, "a window that passes confirms nothing");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "the bootloader's, then the program's");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "a window that passes confirms nothing");
     bench.confirm_program();
-    assert_eq!(boot_ups(&mut bench), 1, "it was called back");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it was called back");
     install(&mut bench, NODE, firmware::APP_V2);
-    assert_eq!(boot_ups(&mut bench), 2, "another program");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "another program");
     write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
-    assert_eq!(boot_ups(&mut bench), 1, "it has confirmed itself");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it has confirmed itself");
+    assert_eq!(bench.session().read_number(CONFIRMATION).unwrap(), INSTALLED | SIGNED);
+    write(&mut bench, CONFIRMATION, 0).unwrap();
+    assert!(write(&mut bench, CONFIRMATION, 4).is_err());
+    bench.power_cycle();
+    bench.run_ms(500);
+    assert!(bench.is_bootloader(NODE), "it has taken that back");
     bench.assert_nothing_unmodelled();
 }
 
@@ -341,9 +299,7 @@ fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
 /// that sends a request in time keeps it in the bootloader.
 #[test]
 fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER).switched_on();
     install(&mut bench, NODE, firmware::APP_V1);
     bench.events();
 
@@ -377,9 +333,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     for (id, data) in
         [(0x600 + u16::from(NODE), [0x40, 0, 0x10, 0, 0, 0, 0, 0]), (0x7E5, [0x4C, 0, 0, 0, 0, 0, 0, 0])]
     {
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_boot_up(100);
         bench.run_ms(100);
         bench.post(id, &data);

@@ -77,6 +77,15 @@ fn python_canopen_updates_the_device_by_raw_images() {
         assert!(text(&output).contains("started; 1F56h is the same"), "{}", text(&output));
         assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
     }
+    // A machine that moves is left alone, and its program stays.
+    endpoint.bench.move_machine(firmware::APP_V2, true);
+    let path = folder.write("again.bin", firmware::raw(firmware::APP_V1));
+    let mut python = python();
+    python.arg(script("image_client.py")).arg(endpoint.address()).arg(path);
+    let output = endpoint.run(&mut python);
+    assert!(!output.status.success() && text(&output).contains("08000022"), "{}", text(&output));
+    endpoint.bench.run_ms(700);
+    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "2.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }
 

@@ -3,9 +3,7 @@
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coboot_tests::bench::{
-    control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
-};
+use coboot_tests::bench::{control, Bench, ACKNOWLEDGED, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER};
 use coflash_core::device::Transfers;
@@ -30,18 +28,6 @@ fn fresh_board(image: &str) -> Bench {
     bench
 }
 
-/// The number of boot-up messages after power-on: for an unconfirmed program, the bootloader sends
-/// one for its rescue window, before the program's own.
-fn boot_ups_after_power_off(bench: &mut Bench) -> usize {
-    bench.power_off();
-    bench.run_ms(100);
-    let from = bench.time();
-    bench.power_on();
-    bench.run_ms(RESCUE_WINDOW_MS + 200);
-    let frames = bench.frames_since(from);
-    frames.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).count()
-}
-
 fn ask(bench: &mut Bench, value: u8) -> Option<Vec<u8>> {
     bench.ask(REQUEST, &control(value), RESPONSE)
 }
@@ -58,7 +44,7 @@ fn the_first_80h_confirms_a_sealed_program_through_a_reset() {
         bench.run_ms(50);
         assert!(!bench.is_bootloader(NODE), "{image}: the program is back");
         assert_eq!(bench.session().read_number(CRC).unwrap(), crc, "{image}");
-        assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}: confirmed for good");
+        assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "{image}: confirmed for good");
         assert_eq!(ask(&mut bench, 0x80).as_deref(), Some(&ACKNOWLEDGED[..]), "{image}");
         bench.await_boot_up(1000);
         bench.run_ms(50);
@@ -84,15 +70,39 @@ fn nothing_takes_the_confirmation_away() {
             bench.await_boot_up(1000);
             bench.run_ms(50);
             assert!(!bench.is_bootloader(NODE), "{image}, {what}");
-            assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}, {what}");
+            assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "{image}, {what}");
         }
         let mut bench = fresh_board(image);
         assert!(ask(&mut bench, 0x80).is_some());
         // NMT reset node.
         bench.post(0x000, &[0x81, NODE]);
         bench.await_boot_up(1000);
-        assert_eq!(boot_ups_after_power_off(&mut bench), 1, "{image}, NMT");
+        assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "{image}, NMT");
     }
+}
+
+/// A machine that moves refuses what needs a reset: the confirmation, too. Nothing is stored; an NMT reset,
+/// which is not refused, opens the rescue window.
+#[test]
+fn a_sealed_program_that_may_not_leave_stays() {
+    let image = firmware::APP_V1;
+    let mut bench = fresh_board(image);
+    assert!(ask(&mut bench, 0x80).is_some());
+    bench.await_boot_up(1000);
+    bench.run_ms(50);
+    let stored = bench.machine().flash().to_vec();
+    bench.move_machine(image, true);
+    for value in [0x80, 0x00, 0x02, 0x03] {
+        assert_eq!(ask(&mut bench, value).as_deref(), Some(&REFUSED[..]), "{value}");
+    }
+    bench.run_ms(700);
+    assert!(!bench.is_bootloader(NODE) && bench.machine().flash() == stored);
+    assert_eq!(bench.boot_ups(|bench| bench.post(0, &[0x81, NODE])), 2, "the window, and the program");
+    assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it is confirmed still");
+    assert!(bench.machine().flash() == stored);
+    let mut bench = fresh_board(image);
+    bench.move_machine(image, true);
+    assert_eq!(ask(&mut bench, 0x80).as_deref(), Some(&REFUSED[..]), "a confirmation needs a reset");
 }
 
 /// A power cut before the reset only loses the confirmation.
@@ -101,7 +111,7 @@ fn a_power_cut_before_the_reset_leaves_an_unconfirmed_program() {
     for image in APPLICATIONS {
         let mut bench = fresh_board(image);
         assert!(ask(&mut bench, 0x80).is_some());
-        assert_eq!(boot_ups_after_power_off(&mut bench), 2, "{image}: a rescue window, and the program");
+        assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "{image}: a rescue window, and the program");
         assert!(!bench.is_bootloader(NODE), "{image}");
     }
 }

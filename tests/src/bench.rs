@@ -8,7 +8,7 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash_core::device::{Session, Timing};
+use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
@@ -349,6 +349,47 @@ impl Bench {
         self.run_ms(20);
         self.session().command(1, ProgramControl::Start).expect("it is answered");
         self.await_boot_up(1000);
+    }
+
+    /// Switches the board on: its bootloader has sent its boot-up.
+    #[must_use]
+    pub fn switched_on(mut self) -> Self {
+        self.power_on();
+        self.await_boot_up(100);
+        self
+    }
+
+    /// Switches the power off for 100 ms, and on.
+    pub fn power_cycle(&mut self) {
+        self.power_off();
+        self.run_ms(100);
+        self.power_on();
+    }
+
+    /// The boot-up messages after this start: one of the program, and one before it of the bootloader if
+    /// the program has a rescue window.
+    pub fn boot_ups(&mut self, start: fn(&mut Self)) -> usize {
+        let from = self.time();
+        start(self);
+        self.run_ms(RESCUE_WINDOW_MS + 200);
+        let frames = self.frames_since(from);
+        frames.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).count()
+    }
+
+    /// The machine of the running application moves from now on, or stands: of the template by the word of
+    /// its interlock, of the probe in C by its object.
+    ///
+    /// # Panics
+    /// If the application has no machine.
+    pub fn move_machine(&mut self, image: &str, moves: bool) {
+        if image == firmware::APP_C_PROBE {
+            let word = u32::from(moves).to_le_bytes();
+            let at = Address::new(0x2100, 16);
+            self.session().write(at, &word, Doing::Write(at), &mut |_| {}).expect("an object of the probe");
+        } else {
+            let word = firmware::symbol(image, |name| name.contains("7MACHINE"));
+            self.machine().write_ram(word, &[u8::from(moves)]).expect("in RAM");
+        }
     }
 
     /// Every good frame that began at or after this time, as identifier and data.

@@ -71,6 +71,20 @@ pub const APP_C_PROBE: &str = "app-c-probe.elf";
 /// See [`APP_C_PROBE`].
 pub const APP_C_PROBE_PROGRAM_2: &str = "app-c-probe-program-2.elf";
 
+/// The address of the first symbol of an image with such a name.
+///
+/// # Panics
+/// If there is none.
+#[must_use]
+pub fn symbol(image: &str, is: impl Fn(&str) -> bool) -> u32 {
+    use object::{Object as _, ObjectSymbol as _};
+    let elf = elf(image);
+    let file = object::File::parse(&*elf).expect("an ELF");
+    let mut symbols = file.symbols();
+    let symbol = symbols.find(|symbol| symbol.name().is_ok_and(&is)).expect("the symbol");
+    symbol.address() as u32 & !1
+}
+
 /// The name of an image for another board than the tested one.
 #[must_use]
 pub fn of_board(board: &str, image: &str) -> String {

@@ -41,7 +41,7 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     let size = match selector {
         Selector::Crc32 => size_of::<Crc32Args>(),
         Selector::ReadNode | Selector::StoreNode => size_of::<NodeArgs>(),
-        Selector::ProgramInfo | Selector::Confirm | Selector::Invalidate => size_of::<ProgramArgs>(),
+        _ => size_of::<ProgramArgs>(),
     };
     if !is_in_ram(args as u32, size as u32) {
         return Status::BadPointer as i32;
@@ -58,9 +58,7 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
         match selector {
             Selector::Crc32 => crc32(&flash, &mut *args.cast()),
             Selector::ReadNode | Selector::StoreNode => node(selector, &mut flash, &mut *args.cast(), false),
-            Selector::ProgramInfo | Selector::Confirm | Selector::Invalidate => {
-                program(selector, &mut flash, &mut *args.cast())
-            }
+            _ => program(selector, &mut flash, &mut *args.cast()),
         }
     };
     flash.release(&rcc);
@@ -172,8 +170,8 @@ fn own_info(flash: &ResidentFlash, record: Option<RenewalRecord>) -> ProgramArgs
     }
 }
 
-/// Reports about a program, confirms it (which also signs it, so that it may start by itself), or
-/// takes back both. A confirmation clears the crash count.
+/// Reports about a program, confirms it (which also signs it, so that it may start by itself), takes
+/// back both, or the confirmation alone. A confirmation clears the crash count.
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
     if PRODUCT.renewal && number == BOOTLOADER && selector == Selector::ProgramInfo {
@@ -195,8 +193,12 @@ fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs
     }
     let record = record.ok_or(Status::NoProgram)?;
     let confirmed = selector == Selector::Confirm;
-    if record.signed != confirmed || record.confirmed != confirmed {
-        let told = ProgramRecord { signed: confirmed, confirmed, ..record };
+    if SEALED && selector == Selector::Unconfirm && record.is_sealed() {
+        return Err(Status::Locked);
+    }
+    let signed = if selector == Selector::Unconfirm { record.signed } else { confirmed };
+    if record.signed != signed || record.confirmed != confirmed {
+        let told = ProgramRecord { signed, confirmed, ..record };
         keep(&mut parameters, flash, Key::program(number), told.value())?;
     }
     if confirmed && crash_count(&parameters, flash) > 0 {

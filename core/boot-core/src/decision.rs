@@ -265,11 +265,12 @@ fn start(
         Ok(program) if !(program.signed() || trial) => refuse(Reason::Unsigned),
         Ok(_) if !(policy.start_allowed)(number) => refuse(Reason::Forbidden),
         Ok(program) => {
-            let window_ms =
-                if program.confirmed() { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };
+            let refused = circumstances.request == Some(BootRequest::Rescue);
+            let proved = program.confirmed() && !refused;
+            let window_ms = if proved { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };
             // A requested start is not delayed: the requesting master asks for the program at once,
             // and this request would keep the device in the bootloader.
-            if circumstances.request.is_none() && window_ms > 0 {
+            if (circumstances.request.is_none() || refused) && window_ms > 0 {
                 return Hold { program: program.number(), window_ms };
             }
             // The bootloader has just had its turn if it has left a request.

@@ -89,8 +89,8 @@ extern const struct coboot_label coboot_label_of_image;
 #define COBOOT_WARM_START_MAGIC UINT32_C(0x31574243)
 
 /* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, node
- * parameters what coboot_stored_node makes, and the others 0. The last three are for what the callgate answers with
- * COBOOT_STATUS_LOCKED. */
+ * parameters what coboot_stored_node makes, and the others 0. Confirm, invalidate and store node are for what the
+ * callgate answers with COBOOT_STATUS_LOCKED. Rescue starts as after a power-on, with the rescue window. */
 #define COBOOT_REQUEST_STAY UINT32_C(0x1)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)
@@ -99,6 +99,7 @@ extern const struct coboot_label coboot_label_of_image;
 #define COBOOT_REQUEST_CONFIRM UINT32_C(0xA)
 #define COBOOT_REQUEST_INVALIDATE UINT32_C(0xB)
 #define COBOOT_REQUEST_STORE_NODE UINT32_C(0xC)
+#define COBOOT_REQUEST_RESCUE UINT32_C(0xF)
 
 struct coboot_warm_start {
     uint32_t magic;
@@ -316,6 +317,7 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, entry) == 12, "coboot_call
 #define COBOOT_SELECTOR_PROGRAM_INFO UINT32_C(0x4)
 #define COBOOT_SELECTOR_CONFIRM UINT32_C(0x5)
 #define COBOOT_SELECTOR_INVALIDATE UINT32_C(0x6)
+#define COBOOT_SELECTOR_UNCONFIRM UINT32_C(0x7)
 
 /* COBOOT_SELECTOR_CRC32: from `address` on, any alignment, `len` bytes of flash; gives `crc`. */
 struct coboot_crc32_args {
@@ -338,7 +340,7 @@ COBOOT_STATIC_ASSERT(sizeof(struct coboot_node_args) == 8, "coboot_node_args");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_node_args, node_id) == 0, "coboot_node_args: node_id");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_node_args, bit_rate) == 4, "coboot_node_args: bit_rate");
 
-/* COBOOT_SELECTOR_PROGRAM_INFO, _CONFIRM and _INVALIDATE: about program `number`; the first gives the rest. */
+/* COBOOT_SELECTOR_PROGRAM_INFO, _CONFIRM, _INVALIDATE and _UNCONFIRM: about program `number`; the first gives the rest. */
 struct coboot_program_args {
     uint32_t number;
     uint32_t size;
@@ -469,6 +471,15 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
 {
     struct coboot_program_args args = { number, 0, 0, 0, 0 };
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
+}
+
+/* Takes back that a program is confirmed, but not its signature: it starts with its rescue window. COBOOT_STATUS_LOCKED for
+ * a sealed program, COBOOT_STATUS_UNKNOWN_SELECTOR of an older bootloader.
+ */
+static inline int32_t coboot_unconfirm(const struct coboot_callgate *gate, uint32_t number)
+{
+    struct coboot_program_args args = { number, 0, 0, 0, 0 };
+    return coboot_call(gate, COBOOT_SELECTOR_UNCONFIRM, &args);
 }
 
 /* Leaves a request for the bootloader and resets the chip. What asked for it is answered before: wait until the answer is

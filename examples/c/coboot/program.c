@@ -39,6 +39,8 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
     program->number = 1;
     program->bootloader = 0;
     program->fresh = false;
+    program->refused = 0;
+    program->may_leave = NULL;
     program->bootloader_answers = false;
     program->reentry.phase = COBOOT_STAYS;
     program->reentry.silent = false;
@@ -120,18 +122,83 @@ static uint32_t leave(struct coboot_program *program, uint32_t request, uint32_t
     return possible ? COBOOT_ABORT_NONE : COBOOT_ABORT_DEVICE_STATE;
 }
 
+/* The answer of the application. A device that is leaving is not asked again. */
+static bool may_leave(const struct coboot_program *program)
+{
+    return coboot_program_leaving(program) || program->may_leave == NULL || program->may_leave();
+}
+
+/* A request of the application itself. */
+static uint32_t leave_if_allowed(struct coboot_program *program, uint32_t request, uint32_t argument, uint32_t now_ms)
+{
+    return may_leave(program) ? leave(program, request, argument, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+}
+
+/* The refusal of a master's command. The next start has the rescue window. */
+static uint32_t refuse(struct coboot_program *program)
+{
+    /* Once since the start: whoever asks for ever wears nothing out. */
+    if (program->refused == 0) {
+        const int32_t status = program->gate != NULL ? coboot_unconfirm(program->gate, program->number)
+                                                     : COBOOT_STATUS_UNKNOWN_SELECTOR;
+        if (status == COBOOT_STATUS_UNKNOWN_SELECTOR) {
+            /* A bootloader without this service does not know the request either. */
+            program->refused = COBOOT_REQUEST_POWER_ON;
+        } else if (status != COBOOT_STATUS_BUSY) {
+            program->refused = COBOOT_REQUEST_RESCUE;
+        }
+    }
+    return COBOOT_ABORT_DEVICE_STATE;
+}
+
+/* A command of a master. */
+static uint32_t leave_for_master(struct coboot_program *program, uint32_t request, uint32_t argument, uint32_t now_ms)
+{
+    return may_leave(program) ? leave(program, request, argument, now_ms) : refuse(program);
+}
+
+uint32_t coboot_program_confirm(struct coboot_program *program, uint32_t now_ms)
+{
+    struct coboot_program_args info;
+
+    if (program->gate == NULL) {
+        program->fresh = false;
+        return COBOOT_ABORT_HARDWARE;
+    }
+    if (program->refused != 0 && coboot_program_info(program->gate, program->number, &info) == COBOOT_STATUS_OK
+        && (info.flags & COBOOT_PROGRAM_SIGNED) != 0) {
+        program->fresh = false;
+        return COBOOT_ABORT_NONE;
+    }
+    const int32_t status = coboot_confirm(program->gate, program->number);
+    if (status == COBOOT_STATUS_LOCKED) {
+        /* The bootloader stores it. Until then another 80h has the same meaning. */
+        return leave_if_allowed(program, COBOOT_REQUEST_CONFIRM, program->number, now_ms);
+    }
+    program->fresh = false;
+    if (status == COBOOT_STATUS_OK && program->refused != 0) {
+        (void)coboot_unconfirm(program->gate, program->number);
+    }
+    return status == COBOOT_STATUS_OK ? COBOOT_ABORT_NONE : COBOOT_ABORT_HARDWARE;
+}
+
 /* Handles the first 80h after a download and start in one go: masters that do not know SYS TEC's
  * commands confirm the program with it.
  */
-static uint32_t confirm(struct coboot_program *program, uint32_t now_ms)
+static uint32_t confirm_for_master(struct coboot_program *program, uint32_t now_ms)
+{
+    const uint32_t abort_code = coboot_program_confirm(program, now_ms);
+    const bool refuses = abort_code == COBOOT_ABORT_DEVICE_STATE && !coboot_program_leaving(program);
+    return refuses ? refuse(program) : abort_code;
+}
+
+uint32_t coboot_program_store_node(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate, uint32_t now_ms)
 {
     const int32_t status =
-        program->gate != NULL ? coboot_confirm(program->gate, program->number) : COBOOT_STATUS_FAILED;
+        program->gate != NULL ? coboot_store_node(program->gate, node_id, bit_rate) : COBOOT_STATUS_FAILED;
     if (status == COBOOT_STATUS_LOCKED) {
-        /* The bootloader stores it. Until then another 80h has the same meaning. */
-        return leave(program, COBOOT_REQUEST_CONFIRM, program->number, now_ms);
+        return leave_if_allowed(program, COBOOT_REQUEST_STORE_NODE, coboot_stored_node(node_id, bit_rate), now_ms);
     }
-    program->fresh = false;
     return status == COBOOT_STATUS_OK ? COBOOT_ABORT_NONE : COBOOT_ABORT_HARDWARE;
 }
 
@@ -154,7 +221,8 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
     }
     switch (value) {
     case START_BOOTLOADER:
-        return own && program->fresh ? confirm(program, now_ms) : leave(program, COBOOT_REQUEST_STAY, 0, now_ms);
+        return own && program->fresh ? confirm_for_master(program, now_ms)
+                                     : leave_for_master(program, COBOOT_REQUEST_STAY, 0, now_ms);
     case STOP:  /* The bootloader runs instead. */
     case CLEAR: /* The bootloader carries it out. */
         /* Masters send the next request at once after the answer, so the bootloader must send this
@@ -162,11 +230,11 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
          */
         if (program->bootloader_answers) {
             const uint32_t owed = coboot_owed(sub, (uint8_t)value, program->node_id);
-            return leave(program, COBOOT_REQUEST_OWED, owed, now_ms);
+            return leave_for_master(program, COBOOT_REQUEST_OWED, owed, now_ms);
         }
-        return value == STOP ? leave(program, COBOOT_REQUEST_STAY, 0, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+        return value == STOP ? leave_for_master(program, COBOOT_REQUEST_STAY, 0, now_ms) : COBOOT_ABORT_DEVICE_STATE;
     case RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
-        return own ? leave(program, COBOOT_REQUEST_START, sub, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+        return own ? leave_for_master(program, COBOOT_REQUEST_START, sub, now_ms) : COBOOT_ABORT_DEVICE_STATE;
     case START: /* It runs already; another one is the bootloader's to start. */
         return own ? COBOOT_ABORT_NONE : COBOOT_ABORT_DEVICE_STATE;
     case SET_SIGNATURE:
@@ -177,10 +245,21 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
     }
 }
 
-void coboot_program_restart(struct coboot_program *program, uint32_t now_ms)
+void coboot_program_nmt_reset(struct coboot_program *program, uint32_t now_ms)
 {
+    const uint32_t request = program->refused != 0 ? program->refused : COBOOT_REQUEST_POWER_ON;
+
     /* An earlier promise to a master has priority; it leads to a reset, too. */
-    (void)coboot_reentry_begin(&program->reentry, COBOOT_REQUEST_POWER_ON, 0, now_ms);
+    (void)coboot_reentry_begin(&program->reentry, request, 0, now_ms);
+}
+
+uint32_t coboot_program_restart(struct coboot_program *program, uint32_t now_ms)
+{
+    if (!may_leave(program)) {
+        return COBOOT_ABORT_DEVICE_STATE;
+    }
+    coboot_program_nmt_reset(program, now_ms);
+    return COBOOT_ABORT_NONE;
 }
 
 void coboot_program_proceed(struct coboot_program *program, bool quiet, uint32_t now_ms)

@@ -24,7 +24,7 @@ static bool has_passed(uint32_t time_ms, uint32_t now_ms)
  */
 static bool is_promise(uint32_t request)
 {
-    return request != COBOOT_REQUEST_START && request != COBOOT_REQUEST_POWER_ON;
+    return request != COBOOT_REQUEST_START && request != COBOOT_REQUEST_POWER_ON && request != COBOOT_REQUEST_RESCUE;
 }
 
 bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint32_t argument, uint32_t now_ms)

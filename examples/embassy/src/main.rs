@@ -38,6 +38,13 @@ const TICK: Duration = Duration::from_millis(2);
 static LAYOUT: Layout = coboot_app::layout!();
 coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);
 
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
+/// answered. A machine that moves says no, and the command is refused (08000022h). After a yes no task may
+/// start what stands (`Responder::leaving`); app-template shows how they exclude each other.
+fn may_leave() -> bool {
+    true
+}
+
 bind_interrupts!(struct Interrupts {
     CAN1_TX => TxInterruptHandler<CAN1>;
     CAN1_RX0 => Rx0InterruptHandler<CAN1>;
@@ -55,7 +62,7 @@ async fn main(spawner: Spawner) {
     let start = Start::read(&LAYOUT, defaults);
     let bootloader = Bootloader::new(&LAYOUT);
     let crc = bootloader.program_crc(start.program);
-    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc);
+    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc).asking(may_leave);
     let device = Device {
         device_type: 0,
         name: NAME,

@@ -62,7 +62,7 @@ fn main() -> ! {
     let start = Start::read(&LAYOUT, defaults);
     let mut bootloader = Bootloader::new(&LAYOUT);
     let crc = bootloader.program_crc(start.program);
-    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc);
+    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc).asking(may_leave);
     let device = Device {
         device_type: 0,
         name: NAME,
@@ -111,12 +111,19 @@ fn main() -> ! {
             bootloader.leave(ReentryPath::SystemReset, request);
         }
 
-        // Your own work: whatever does not take longer than some milliseconds.
+        // Your own work: whatever does not take longer than some milliseconds. What stands must not
+        // start to move while `responder.leaving()`: the reset comes within half a second.
         led.set_state((now / 500).is_multiple_of(2).into());
 
         // Until the next millisecond.
         cortex_m::asm::wfi();
     }
+}
+
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
+/// answered. A machine that moves says no, and the command is refused (08000022h).
+fn may_leave() -> bool {
+    true
 }
 
 /// Switches the crystal on. Returns whether it runs in time; the HAL would wait for it without a bound. With a

@@ -13,6 +13,13 @@ use crate::stack::{AbortCode, Confirmation, Dictionary, Value};
 /// 2000h, an object of the application: half the period of the LED, in ms.
 pub static BLINK_MS: AtomicU16 = AtomicU16::new(500);
 
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
+/// answered. A machine that moves says no, and the command is refused (08000022h). After a yes
+/// `ProgramControl::leaving` is true until the reset, and what stands must not start to move.
+fn may_leave() -> bool {
+    true
+}
+
 /// The values of the dictionary.
 pub struct Objects {
     control: ProgramControl,
@@ -27,7 +34,7 @@ impl Objects {
     pub fn new(start: &Start, bootloader: Bootloader) -> Self {
         let crc = bootloader.program_crc(start.program);
         Self {
-            control: ProgramControl::new(start, LAYOUT.programs.len() as u8, crc),
+            control: ProgramControl::new(start, LAYOUT.programs.len() as u8, crc).asking(may_leave),
             bootloader,
             serial_number: start.serial_number,
             now: 0,
@@ -36,7 +43,7 @@ impl Objects {
 
     /// NMT reset node came.
     pub fn reset(&mut self) {
-        self.control.restart(self.now);
+        self.control.nmt_reset(self.now);
     }
 
     /// Goes on with the way back. `bus_idle`: all that was sent is on the bus and acknowledged.

@@ -29,10 +29,11 @@ fn numbers_are_those_of_the_header() {
         Selector::ProgramInfo,
         Selector::Confirm,
         Selector::Invalidate,
+        Selector::Unconfirm,
     ];
     for (number, selector) in (1..).zip(selectors) {
         assert_eq!(Selector::from_number(number), Some(selector));
         assert_eq!(selector as u32, number);
     }
-    assert_eq!((Selector::from_number(0), Selector::from_number(7)), (None, None));
+    assert_eq!((Selector::from_number(0), Selector::from_number(8)), (None, None));
 }

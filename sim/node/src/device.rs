@@ -458,7 +458,7 @@ impl Running<StandIn> {
         }
         self.device.set_time(now);
         if self.slave.handle(frame, now, &mut self.device) {
-            self.device.control.restart(now.as_millis());
+            self.device.control.nmt_reset(now.as_millis());
         }
         self.device.leave_owed(&mut self.slave);
     }

@@ -176,7 +176,7 @@ mod app {
             debugger.with(device, |device| carry_out(slave, &mut can, now, device));
             let Some(frame) = to_handle.dequeue() else { return };
             if debugger.with(device, |device| slave.handle(&frame, now, device)) {
-                device.application.control.restart(now.as_millis());
+                device.application.control.nmt_reset(now.as_millis());
             }
             device.application.leave_owed(slave);
             if !serves(slave, &mut can, &mut device.application) {
