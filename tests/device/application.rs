@@ -84,10 +84,7 @@ fn blocks(elf: &[u8]) -> Program {
 }
 
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 fn number(bench: &mut Bench, index: u16, sub: u8) -> u32 {

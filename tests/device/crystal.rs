@@ -27,9 +27,7 @@ fn announced(bench: &Bench) -> Option<u8> {
 
 #[test]
 fn with_its_crystal_a_device_says_so() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.run_ms(5);
     assert_eq!(announced(&bench), Some(6), "no program");
     assert_eq!(bench.session().read_number(CLOCK).unwrap(), 1);

@@ -20,10 +20,7 @@ const VERSION: Address = Address::new(0x100A, 0);
 
 /// A board in its bootloader, without a program.
 pub(super) fn empty_board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 /// A board that runs version 1.
@@ -171,9 +168,7 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
             }
         });
         assert!(matches!(outcome, Err(Error::Cancelled)), "cut at {after_ms} ms: {outcome:?}");
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_program(1000);
         if !bench.session().device_type().unwrap().unwrap().is_bootloader() {
             assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0", "cut at {after_ms} ms");
@@ -205,9 +200,7 @@ fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_sta
     bench.session().command(1, ProgramControl::ClrSignature).unwrap();
     bench.session().await_idle(1, Doing::Command(ProgramControl::ClrSignature)).unwrap();
     let running = |bench: &mut Bench| {
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_boot_up(1000);
         bench.session().device_type().unwrap().unwrap()
     };

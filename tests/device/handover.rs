@@ -65,9 +65,7 @@ fn differences(found: &BTreeMap<u32, u32>, reset: &BTreeMap<u32, u32>) -> Vec<St
 
 /// A board that runs an application.
 fn running_board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let blocks = firmware::blocks(firmware::APP_V1);
     flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
     bench.events();
@@ -128,9 +126,7 @@ fn the_application_finds_the_chip_as_after_a_reset() {
     let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
     let blocks = program_of(image, &Options::default()).unwrap().program;
 
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
     release(&mut bench.session(), 1, &mut |_| {}).unwrap();

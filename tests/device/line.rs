@@ -20,9 +20,7 @@ const LSS_RESPONSE: u32 = 0x7E4;
 
 /// A board in its bootloader, without a program.
 fn empty_board() -> Bench {
-    let mut bench = Bench::complete();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::complete().switched_on();
     // The emergency after the boot-up message.
     bench.run_ms(5);
     bench
@@ -345,9 +343,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
 #[test]
 fn frames_lost_in_a_flood_are_told_once() {
     // It computes a CRC of 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16).switched_on();
     store(&mut bench, NODE, BitRate::K1000);
     restart(&mut bench);
     bench.set_host_bit_rate(1_000_000);

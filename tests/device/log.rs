@@ -27,9 +27,7 @@ fn ways() -> [(&'static str, Listener); 4] {
 fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
     for (image, mut listener) in ways() {
         println!("{image}");
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         bench.run_ms(10);
         assert_eq!(
             listener.told(&mut bench),
@@ -92,9 +90,7 @@ fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
     // A whole update; the program starts.
     for (image, mut listener) in ways() {
         println!("{image}: an update");
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         let file = firmware::blocks(firmware::APP_V1);
         flash(&mut bench.session(), &file, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
         // Room for the lines to come.
@@ -144,9 +140,7 @@ fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
 fn nobody_waits_for_who_reads_it() {
     for (image, mut listener) in ways() {
         println!("{image}");
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         bench.set_host_bit_rate(125_000);
         for _ in 0..100 {
             // Two lines of about 40 characters, which take 7 ms on a UART.
@@ -171,9 +165,7 @@ fn nobody_waits_for_who_reads_it() {
 /// does not wait.
 #[test]
 fn the_uart_speaks_while_the_flash_erases() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART).switched_on();
     bench.install(firmware::APP_V1);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
@@ -231,9 +223,7 @@ fn a_release_has_nothing_of_it() {
     assert_eq!(has(firmware::BOOTLOADER_LOG_DEFMT), (true, true, true));
     for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::BOOTLOADER_LEAST] {
         assert_eq!(has(image), (false, false, false), "{image}");
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         bench.session().command(1, ProgramControl::Start).unwrap();
         bench.run_ms(20);
         let touched = bench.machine().usarts_mut().iter().find(|usart| usart.accesses() > 0);

@@ -33,10 +33,7 @@ fn mute() -> Program {
 }
 
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate) {
@@ -126,9 +123,7 @@ fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
         // frames that the host's controller still has to send, because no node has acknowledged
         // them.
         for _ in 0..2 {
-            bench.power_off();
-            bench.run_ms(100);
-            bench.power_on();
+            bench.power_cycle();
             bench.run_ms(1000);
         }
         assert!(bench.session().device_type().unwrap().is_none(), "the program runs");

@@ -101,9 +101,7 @@ fn block_download_has_the_products_sub_blocks_or_is_not_there() {
     let answer = bench.ask(0x6AA, &initiate, 0x4AA).unwrap();
     assert_eq!(answer, [0xA4, 0x50, 0x1F, 1, 20, 0, 0, 0]);
 
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST).switched_on();
     let refused = bench.ask(0x601, &initiate, 0x581).unwrap();
     assert_eq!((refused[0], refused[4..].to_vec()), (0x80, vec![0x01, 0, 0x04, 0x05]));
     let file = firmware::blocks(firmware::APP_V1);

@@ -54,9 +54,7 @@ fn board() -> Bench {
 
 /// A board with a program that has shown that it comes back, in the bootloader.
 fn board_on(options: Options) -> Bench {
-    let mut bench = Bench::with(options);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::with(options).switched_on();
     let blocks = firmware::blocks(firmware::APP_V1);
     flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.confirm_program();
@@ -76,9 +74,7 @@ fn home(size: usize) -> Region {
 }
 
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.run_ms(500);
 }
 

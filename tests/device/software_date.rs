@@ -31,9 +31,7 @@ fn date(bench: &mut Bench) -> [u32; 2] {
 
 #[test]
 fn every_program_and_its_bootloader_have_the_date_of_the_program() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     assert_eq!(date(&mut bench), [0, 0], "no program");
     for (image, (seconds, expected)) in [
         (firmware::APP_V1, DATE),

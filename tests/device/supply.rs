@@ -20,9 +20,7 @@ const LOW: u32 = 2_500;
 
 /// A board with a program, in its bootloader.
 fn board_with_a_program() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     update(&mut bench, firmware::APP_V1).unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
@@ -146,9 +144,7 @@ fn a_device_that_its_supply_resets_in_the_middle_of_an_update_is_reachable() {
 /// The width of all that is programmed follows from the board's supply (RM0090 table 13).
 #[test]
 fn a_word_is_programmed_as_wide_as_the_supply_allows() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.machine().keep_flash_log();
     update(&mut bench, firmware::APP_V1).unwrap();
     let log = bench.machine().take_flash_log();

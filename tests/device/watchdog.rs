@@ -32,9 +32,7 @@ fn patch(bench: &mut Bench, function: &str, code: &[u16]) {
 }
 
 fn running_bootloader() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.run_ms(20);
     bench.events();
     bench
@@ -102,9 +100,7 @@ fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
 
 #[test]
 fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let file = firmware::blocks(firmware::APP_V1);
     flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.confirm_program();

@@ -15,9 +15,7 @@ const TWO_RESETS: u8 = 13;
 
 /// A board with a confirmed program that runs.
 fn running_board(image: &str) -> Bench {
-    let mut bench = Bench::of_image(image);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(image).switched_on();
     let blocks = firmware::blocks(firmware::APP_V1);
     // This program does not feed a watchdog: it would not live through the watch of the tool.
     let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));

@@ -11,9 +11,7 @@ use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 
 fn bootloader() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.run_ms(20);
     bench
 }

@@ -85,10 +85,7 @@ fn dcfchk_finds_no_fault_in_the_files_and_one_in_each_damaged_copy() {
 }
 
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 /// The board with version 1 of the application running.

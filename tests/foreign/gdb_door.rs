@@ -71,9 +71,7 @@ fn ended(child: &mut Child) -> bool {
 
 #[test]
 fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().trial_run(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     bench.confirm_program();

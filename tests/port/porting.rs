@@ -244,9 +244,7 @@ fn a_board_with_a_low_supply_programs_no_wider_than_its_flash_takes() {
             copy.target.join("firmware/stm32f407g-disc1").join(name).to_str().expect("a name").to_owned()
         };
         let options = Options { vdd_mv: supply_mv, ..Options::default() };
-        let mut bench = Bench::of_image_with(&image(firmware::BOOTLOADER), options);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image_with(&image(firmware::BOOTLOADER), options).switched_on();
         bench.machine().keep_flash_log();
         let update = FlashOptions::default().trial_run(false);
         let blocks = firmware::blocks(&image(firmware::APP_V1));

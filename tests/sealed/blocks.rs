@@ -58,9 +58,7 @@ fn send_all(bench: &mut Bench, blocks: &[Vec<u8>]) -> u32 {
 }
 
 fn cut_power(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(1000);
 }
 

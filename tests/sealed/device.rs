@@ -98,9 +98,7 @@ fn the_date_of_a_sealed_program_is_that_of_its_manifest() {
 /// The power is cut and returns: the old program, version 1, starts by itself. It is then called
 /// back.
 fn assert_old_program_starts(bench: &mut Bench, what: &str) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     assert!(!bench.is_bootloader(NODE), "{what}: the old program does not start");
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0", "{what}");
@@ -294,9 +292,7 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     bench.session().await_idle(1, Doing::Command(ProgramControl::Clear)).unwrap();
     assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), 0, "erased");
 
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(100);
     assert_eq!(challenge(&mut bench.session()).unwrap().granted(), 0, "until the reset");
     let told: Vec<u32> = events(&mut bench.session()).unwrap().iter().map(|event| event.what).collect();
@@ -320,9 +316,7 @@ fn the_holder_of_the_root_key_opens_the_device_for_good() {
     assert!(ask_by(&mut bench, &root()));
     assert_eq!(write(&mut bench, &raw, Transfers::Segments).1, status::NO_ACCESS, "not before the reset");
     for round in 0..2 {
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_program(1000);
         call_back(&mut bench);
         assert!(!challenge(&mut bench.session()).unwrap().is_sealed(), "round {round}");

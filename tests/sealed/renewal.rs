@@ -71,9 +71,7 @@ fn send(bench: &mut Bench, file: &[u8]) -> u32 {
 }
 
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(NODE));
 }

@@ -23,9 +23,7 @@ const THREE_STARTS_MS: u64 = 3_000;
 
 /// The cells of a flash with the bootloader and this program, which starts by itself.
 fn installed(program: &Program) -> Vec<u8> {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().trial_run(false);
     flash(&mut bench.session(), program, &options, &mut |_| {}).expect("it is installed");
     bench.machine().flash().to_vec()

@@ -56,9 +56,7 @@ pub fn play(seed: u64) {
 /// As [`play`].
 pub fn play_on(scenario: &Scenario, silicon: Silicon, seed: u64) {
     println!("{}, silicon {seed}: {silicon}", scenario.name);
-    let mut bench = Bench::with(Options { silicon, seed, ..Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::with(Options { silicon, seed, ..Options::default() }).switched_on();
     (scenario.play)(&mut bench, &mut Random(seed));
     bench.assert_nothing_unmodelled();
 }
@@ -69,9 +67,7 @@ fn install(bench: &mut Bench, image: &str) {
 }
 
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     bench.events();
 }

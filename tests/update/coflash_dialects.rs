@@ -52,18 +52,14 @@ fn version(bench: &mut Bench, node: u8) -> String {
 }
 
 fn power_cycle(bench: &mut Bench, node: u8) {
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program_of(node, 1000);
 }
 
 #[test]
 fn images_and_intel_hex_update_the_standard_firmware() {
     for dialect in [Dialect::Raw, Dialect::Hex] {
-        let mut bench = Bench::new();
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::new().switched_on();
         let options = FlashOptions::default().dialect(Some(dialect)).verify(true);
         // Into an empty device, and into a device with a running application.
         for (image, expected) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {

@@ -83,9 +83,7 @@ fn with_a_program(
     silicon: Silicon,
     answer: fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>,
 ) -> (Vec<String>, Vec<String>, Option<u32>) {
-    let mut bench = Bench::with(Options { silicon, ..Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::with(Options { silicon, ..Options::default() }).switched_on();
     let program = Arc::new(firmware::blocks(firmware::APP_V1));
     let crc = program.crc();
     let installing: Vec<_> = checks().into_iter().filter(|check| check.installs).collect();
@@ -151,9 +149,7 @@ fn ids(lines: &[String]) -> Vec<&str> {
 
 #[test]
 fn the_bootloader_passes() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let (failed, skipped) = verdicts(&mut bench, &harmless(), means());
     assert!(failed.is_empty(), "{failed:#?}");
     // A compact map has no room for block upload (docs/adr/0020), which these checks read by.
@@ -178,9 +174,7 @@ fn the_bootloader_passes() {
 
 /// The checks of the bootloader's own number, on a board with this fault.
 fn of_renewal(answer: fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>) -> (Vec<String>, Vec<String>, Vec<Operation>) {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.machine().keep_flash_log();
     let all: Vec<_> = checks().into_iter().filter(|check| check.group() == "REN").collect();
     let mut faulty = Faulty { bench: &mut bench, power: Rc::default(), answer, asked: [0; 8] };
@@ -289,9 +283,7 @@ fn a_device_in_the_middle_of_a_renewal_is_left_alone() {
 
 #[test]
 fn an_application_passes_and_keeps_its_state() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     bench.post(0x000, &[0x01, NODE]);

@@ -9,9 +9,7 @@ use coflash_core::update::{flash, Event, FlashOptions};
 
 #[test]
 fn an_empty_board_says_boot_up_and_serves_its_objects() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let mut session = bench.session();
     assert_eq!(session.read_number(Address::new(0x1000, 0)).unwrap(), 0x1000_0000);
     assert_eq!(session.read_number(Address::new(0x1F57, 1)).unwrap(), 0);
@@ -21,9 +19,7 @@ fn an_empty_board_says_boot_up_and_serves_its_objects() {
 
 #[test]
 fn the_main_job() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
 
     let mut events = Vec::new();
     let report = flash(

@@ -22,10 +22,7 @@ const SECOND: u32 = 0x0009_0002;
 
 /// A board without a program, in its bootloader.
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 fn renewed(bench: &mut Bench, to: u32) -> Result<Renewal, Error> {

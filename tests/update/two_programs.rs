@@ -59,9 +59,7 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     if !is_its_chip() {
         return;
     }
-    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
     // 1F50h to 1F57h have the two programs, the bootloader, and nothing more.
     for index in [0x50, 0x51, 0x56, 0x57] {
         let highest = bench.ask(0x601, &[0x40, index, 0x1F, 0, 0, 0, 0, 0], 0x581).unwrap();
@@ -106,9 +104,7 @@ fn a_block_for_the_other_program_is_refused() {
     if !is_its_chip() {
         return;
     }
-    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
     let second = blocks(firmware::PROGRAM_2, 2);
     let options = FlashOptions::default().program(1).start(false).repeats(0);
     // The device reports its regions to the host, and the host sends nothing. A host without this
@@ -134,9 +130,8 @@ fn a_second_program_is_written_to_a_running_device() {
         return;
     }
     for (first, second) in PAIRS {
-        let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench =
+            Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
         let (one, two) = (blocks(first, 1), blocks(second, 2));
         flash(&mut bench.session(), &one, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
         let read = |bench: &mut Bench, index: u8, sub: u8| {
@@ -190,9 +185,8 @@ fn commands_for_the_other_program_lead_into_the_bootloader() {
     }
     for (first, _) in PAIRS {
         for value in [0x00, 0x03, 0x80] {
-            let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
-            bench.power_on();
-            bench.await_boot_up(100);
+            let mut bench =
+                Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
             let mut session = bench.session();
             session.transfer_by(Transfers::Segments);
             let image = firmware::raw_from(LAYOUT.programs[0].base, &firmware::of_board(LAYOUT.board, first));

@@ -91,9 +91,7 @@ fn refuse(bench: &mut Bench, file: &[u8]) -> Outcome<()> {
         print_line(bench.time(), &format!("the device breaks the transfer off: {}", AbortCode(code)));
     }
     print_line(bench.time(), &format!("refused, 1F57h = {word:02X}h: {error}"));
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(1000);
     if bench.is_bootloader(NODE) {
         return Err("the old program does not start".into());
