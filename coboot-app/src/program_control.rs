@@ -363,7 +363,8 @@ impl ProgramControl {
     /// [`Abort::DEVICE_STATE`] where the device may not leave now, or leaves for another reason.
     pub fn confirm(&mut self, now: u32, services: &mut impl Services) -> Result<(), Abort> {
         let is_released = |info: ProgramArgs| info.flags & PROGRAM_SIGNED != 0;
-        if self.refused.is_some() && services.program_info(self.program).is_ok_and(is_released) {
+        let keeps_window = self.refused == Some(BootRequest::Rescue);
+        if keeps_window && services.program_info(self.program).is_ok_and(is_released) {
             // There is nothing to store, however often it comes.
             self.fresh = false;
             return Ok(());
@@ -372,7 +373,7 @@ impl ProgramControl {
         // Until it is stored, an 80h that comes again means the same.
         self.fresh &= confirmed == Ok(Confirmed::AtReset);
         match confirmed {
-            Ok(Confirmed::Now) if self.refused.is_some() => {
+            Ok(Confirmed::Now) if keeps_window => {
                 services.unconfirm(self.program).map_err(|_| Abort::HARDWARE)
             }
             Ok(Confirmed::Now) => Ok(()),

@@ -11,7 +11,6 @@ use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{firmware, script};
 use coflash_core::device::debugger::{Debugger, NoBreakpoint, Stopped};
 use coflash_core::device::Doing;
-use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
@@ -48,8 +47,7 @@ fn bootloader() -> Bench {
 /// A board with an application that has the interface, and a standard bootloader.
 fn application() -> Bench {
     let mut bench = Bench::new().switched_on();
-    let file = firmware::blocks(firmware::APP_DEBUGGER);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.install(firmware::APP_DEBUGGER);
     bench.confirm_program();
     bench.events();
     bench

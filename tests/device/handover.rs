@@ -65,9 +65,7 @@ fn differences(found: &BTreeMap<u32, u32>, reset: &BTreeMap<u32, u32>) -> Vec<St
 
 /// A board that runs an application.
 fn running_board() -> Bench {
-    let mut bench = Bench::new().switched_on();
-    let blocks = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap();
+    let mut bench = crate::device::running_board();
     bench.events();
     bench
 }

@@ -5,7 +5,6 @@ use canopen::{AbortCode, Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{call_back, firmware};
 use coflash_core::device::Doing;
-use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
@@ -18,16 +17,6 @@ const CONFIRMATION: Address = Address::new(0x2001, 0);
 const INSTALLED: u32 = 1;
 const SIGNED: u32 = 2;
 
-fn install(bench: &mut Bench, node: u8, image: &str) {
-    flash(
-        &mut bench.session_with(node),
-        &firmware::blocks(image),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
-}
-
 /// A board that runs version 1.
 fn running_board() -> Bench {
     running_board_with(TYPICAL)
@@ -35,7 +24,7 @@ fn running_board() -> Bench {
 
 fn running_board_with(silicon: Silicon) -> Bench {
     let mut bench = Bench::with(Options { silicon, ..Options::default() }).switched_on();
-    install(&mut bench, NODE, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     bench.events();
     bench
@@ -72,7 +61,7 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
         assert!(boot_up - answer.0 >= Span::from_millis(10), "way {way}");
         assert!(bench.is_bootloader(NODE), "way {way}");
 
-        install(&mut bench, NODE, firmware::APP_V2);
+        bench.install(firmware::APP_V2);
         assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "way {way}");
         // A request is valid once.
         power_cycle(&mut bench);
@@ -181,7 +170,7 @@ fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
 fn node_id_and_bit_rate_are_shared() {
     for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
         let mut bench = Bench::of_image(bootloader).switched_on();
-        install(&mut bench, NODE, firmware::APP_V1);
+        bench.install(firmware::APP_V1);
         let serial = bench.session().read_number(Address::new(0x1018, 4)).unwrap();
 
         store_by_lss(&mut bench, 9, Some(BitRate::K250));
@@ -277,12 +266,12 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
 #[test]
 fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
     let mut bench = Bench::new().switched_on();
-    install(&mut bench, NODE, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "the bootloader's, then the program's");
     assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "a window that passes confirms nothing");
     bench.confirm_program();
     assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it was called back");
-    install(&mut bench, NODE, firmware::APP_V2);
+    bench.install(firmware::APP_V2);
     assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "another program");
     write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it has confirmed itself");
@@ -300,7 +289,7 @@ fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
 #[test]
 fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER).switched_on();
-    install(&mut bench, NODE, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     bench.events();
 
     // Without a request: 300 ms, then the program, after a reset.

@@ -55,8 +55,7 @@ fn board() -> Bench {
 /// A board with a program that has shown that it comes back, in the bootloader.
 fn board_on(options: Options) -> Bench {
     let mut bench = Bench::with(options).switched_on();
-    let blocks = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     call_back(&mut bench);
     bench

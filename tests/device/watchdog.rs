@@ -101,8 +101,7 @@ fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
 #[test]
 fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
     let mut bench = Bench::new().switched_on();
-    let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     for crash in 1..=3 {
         bench.events();

@@ -137,16 +137,13 @@ static uint32_t leave_if_allowed(struct coboot_program *program, uint32_t reques
 /* The refusal of a master's command. The next start has the rescue window. */
 static uint32_t refuse(struct coboot_program *program)
 {
-    /* Once since the start: whoever asks for ever wears nothing out. */
-    if (program->refused == 0) {
-        const int32_t status = program->gate != NULL ? coboot_unconfirm(program->gate, program->number)
-                                                     : COBOOT_STATUS_UNKNOWN_SELECTOR;
-        if (status == COBOOT_STATUS_UNKNOWN_SELECTOR) {
-            /* A bootloader without this service does not know the request either. */
-            program->refused = COBOOT_REQUEST_POWER_ON;
-        } else if (status != COBOOT_STATUS_BUSY) {
-            program->refused = COBOOT_REQUEST_RESCUE;
-        }
+    /* Stored once since the start: whoever asks for ever wears nothing out. */
+    if (program->refused != COBOOT_REQUEST_RESCUE) {
+        const int32_t status =
+            program->gate != NULL ? coboot_unconfirm(program->gate, program->number) : COBOOT_STATUS_FAILED;
+        const bool is_known = status == COBOOT_STATUS_OK || status == COBOOT_STATUS_LOCKED;
+        /* A bootloader without this service would take the request for a crash. */
+        program->refused = is_known ? COBOOT_REQUEST_RESCUE : COBOOT_REQUEST_POWER_ON;
     }
     return COBOOT_ABORT_DEVICE_STATE;
 }
@@ -159,13 +156,14 @@ static uint32_t leave_for_master(struct coboot_program *program, uint32_t reques
 
 uint32_t coboot_program_confirm(struct coboot_program *program, uint32_t now_ms)
 {
+    const bool keeps_window = program->refused == COBOOT_REQUEST_RESCUE;
     struct coboot_program_args info;
 
     if (program->gate == NULL) {
         program->fresh = false;
         return COBOOT_ABORT_HARDWARE;
     }
-    if (program->refused != 0 && coboot_program_info(program->gate, program->number, &info) == COBOOT_STATUS_OK
+    if (keeps_window && coboot_program_info(program->gate, program->number, &info) == COBOOT_STATUS_OK
         && (info.flags & COBOOT_PROGRAM_SIGNED) != 0) {
         program->fresh = false;
         return COBOOT_ABORT_NONE;
@@ -176,7 +174,7 @@ uint32_t coboot_program_confirm(struct coboot_program *program, uint32_t now_ms)
         return leave_if_allowed(program, COBOOT_REQUEST_CONFIRM, program->number, now_ms);
     }
     program->fresh = false;
-    if (status == COBOOT_STATUS_OK && program->refused != 0) {
+    if (status == COBOOT_STATUS_OK && keeps_window) {
         (void)coboot_unconfirm(program->gate, program->number);
     }
     return status == COBOOT_STATUS_OK ? COBOOT_ABORT_NONE : COBOOT_ABORT_HARDWARE;

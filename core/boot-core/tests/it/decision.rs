@@ -206,6 +206,7 @@ fn resets_in_a_row_are_counted_until_somebody_asks() {
         (BootRequest::Start(1), 0),
         (BootRequest::Trial(1), 0),
         (BootRequest::PowerOn, 0),
+        (BootRequest::Rescue, 0),
         (BootRequest::Fault, 2),
         (BootRequest::Resume(1), 2),
     ] {
@@ -261,6 +262,10 @@ fn the_rescue_window_is_for_a_start_that_nobody_asked_for() {
     }
     let confirmed = || check_record(true, true, |_| {});
     assert_eq!(decide(&QUIET, &policy, |_| confirmed()), BootDecision::Hold { program: 1, window_ms: 20 });
+    // It has refused to leave.
+    let refused = Circumstances { request: Some(BootRequest::Rescue), ..QUIET };
+    let held = BootDecision::Hold { program: 1, window_ms: 300 };
+    assert_eq!(decide(&refused, &policy, |_| confirmed()), held);
     let policy = Policy { rescue_window_confirmed_ms: 0, ..policy };
     let start = BootDecision::Start { program: confirmed().unwrap(), trial: false };
     assert_eq!(decide(&QUIET, &policy, |_| confirmed()), start);
