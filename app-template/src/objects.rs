@@ -43,9 +43,9 @@ static ENTRIES: [Entry; entry_count(NUMBERS)] = entries(NUMBERS).entries();
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
 
-/// What the machine does: it stands, it moves, or it stands because the device leaves. What moves starts
-/// by a `compare_exchange` from `STANDS` to `MOVES`, in whatever task, and not at all if that fails: the
-/// question below and the start exclude each other.
+/// What the machine does: it stands, it moves, or it stands because the device leaves. What moves
+/// starts by a `compare_exchange` from `STANDS` to `MOVES`, in whatever task, and not at all if
+/// that fails: the question below and the start exclude each other.
 pub static MACHINE: AtomicU8 = AtomicU8::new(STANDS);
 /// See [`MACHINE`].
 pub const STANDS: u8 = 0;
@@ -55,9 +55,9 @@ pub const MOVES: u8 = 1;
 pub const LEAVES: u8 = 2;
 
 /// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
-/// command is answered or left to the bootloader: 1F51h = 80h, 0, 2 and 3, and what a sealed program
-/// stores. After a no the command is refused (08000022h), and the program stays. A yes is final: the
-/// reset follows within half a second, and until then the machine does not start.
+/// command is answered or left to the bootloader: 1F51h = 80h, 0, 2 and 3, and what a sealed
+/// program stores. After a no the command is refused (08000022h), and the program stays. A yes is
+/// final: the reset follows within half a second, and until then the machine does not start.
 fn may_leave() -> bool {
     MACHINE.compare_exchange(STANDS, LEAVES, SeqCst, SeqCst).is_ok()
 }

@@ -48,7 +48,6 @@ impl Confirmed {
     /// # Errors
     /// The callgate's error, unless the confirmation was stored or the flash was locked.
     pub const fn from_outcome(outcome: Result<(), CallgateError>) -> Result<Self, CallgateError> {
-        const LOCKED: i32 = Status::Locked as i32;
         match outcome {
             Ok(()) => Ok(Self::Now),
             Err(CallgateError::Refused(LOCKED)) => Ok(Self::AtReset),
@@ -57,6 +56,8 @@ impl Confirmed {
     }
 }
 
+/// The callgate cannot store before a reset.
+pub(crate) const LOCKED: i32 = Status::Locked as i32;
 /// What is stored in the place of a node-ID for a device that waits for one.
 pub(crate) const NO_NODE_ID: u8 = 255;
 

@@ -17,7 +17,7 @@
 //!
 //! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
-use shared_abi::callgate::{CallgateError, ProgramArgs, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED};
+use shared_abi::callgate::{CallgateError, ProgramArgs, PROGRAM_INSTALLED, PROGRAM_SIGNED};
 use shared_abi::geometry::Region;
 use shared_abi::handoff::SdoBases;
 use shared_abi::layout::Layout;
@@ -25,7 +25,7 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::{BootRequest, Owed, StoredNode};
 
 use crate::abort::Abort;
-use crate::bootloader::{Bootloader, Confirmed, Services, NO_NODE_ID};
+use crate::bootloader::{Bootloader, Confirmed, Services, LOCKED, NO_NODE_ID};
 use crate::departure::{Departure, Next};
 use crate::rules::{react, Command, Reaction, Standing};
 use crate::start::Start;
@@ -41,8 +41,6 @@ pub const FLASH_STATUS: u16 = 0x1F57;
 /// 2007h: device state, an object of coboot. An application has its sub-index 1 alone.
 pub const DEVICE_STATE: u16 = 0x2007;
 
-/// The callgate cannot store before a reset.
-const LOCKED: i32 = Status::Locked as i32;
 /// The value of 1F51h for a program that is installed and does not run.
 const STOPPED: u8 = 0;
 /// The value of 1F51h for the program that runs.
@@ -129,15 +127,16 @@ impl ProgramControl {
         Self { bootloader_node: None, ..self }
     }
 
-    /// With the application's rule about leaving, which is asked once before a command of 1F51h, or a
-    /// request of the application itself, ends in a reset. It answers at once. No: the command is refused
-    /// (08000022h), and nothing is owed. Yes is final: the reset follows, 500 ms later at most, and what
-    /// stands must not start to move while [`leaving`](Self::leaving). An NMT reset does not ask.
+    /// With the application's rule about leaving, which is asked once before a command of 1F51h, or
+    /// a request of the application itself, ends in a reset. It answers at once. No: the command is
+    /// refused (08000022h), and nothing is owed. Yes is final: the reset follows, 500 ms later at
+    /// most, and what stands must not start to move while [`leaving`](Self::leaving). An NMT reset
+    /// does not ask.
     ///
-    /// So that an application which refuses for ever does not lock itself in, its first refusal of a
-    /// master takes back that it is confirmed: the next start has the rescue window. That writes flash
-    /// as [`Bootloader::store_node`] does. For a sealed program nothing is stored; it has the window
-    /// after an NMT reset.
+    /// So that an application which refuses for ever does not lock itself in, its first refusal of
+    /// a master takes back that it is confirmed: the next start has the rescue window. That writes
+    /// flash as [`Bootloader::store_node`] does. For a sealed program nothing is stored; it has the
+    /// window after an NMT reset.
     #[must_use]
     pub const fn asking(self, may_leave: fn() -> bool) -> Self {
         Self { may_leave, ..self }
@@ -353,10 +352,11 @@ impl ProgramControl {
         self.departure.begin_silent(BootRequest::Owed(owed), now);
     }
 
-    /// This program is good: it has heard its master, say, or a master has said so. Where the flash is
-    /// locked (a sealed program) the device restarts to store it, if it [may leave](Self::asking). Writes
-    /// flash ([`Bootloader::store_node`] says how long that takes). A program that has refused to leave
-    /// since its start is released by this, and keeps its rescue window.
+    /// This program is good: it has heard its master, say, or a master has said so. Where the flash
+    /// is locked (a sealed program) the device restarts to store it, if it [may
+    /// leave](Self::asking). Writes flash ([`Bootloader::store_node`] says how long that takes). A
+    /// program that has refused to leave since its start is released by this, and keeps its rescue
+    /// window.
     ///
     /// # Errors
     /// [`Abort::HARDWARE`] where the bootloader did not store it, or there is none;
@@ -365,7 +365,6 @@ impl ProgramControl {
         let is_released = |info: ProgramArgs| info.flags & PROGRAM_SIGNED != 0;
         let keeps_window = self.refused == Some(BootRequest::Rescue);
         if keeps_window && services.program_info(self.program).is_ok_and(is_released) {
-            // There is nothing to store, however often it comes.
             self.fresh = false;
             return Ok(());
         }
@@ -382,8 +381,9 @@ impl ProgramControl {
         }
     }
 
-    /// [`Bootloader::store_node`] for values that the application itself decides on. Where the flash is
-    /// locked (a sealed program) the device restarts to store them, if it [may leave](Self::asking).
+    /// [`Bootloader::store_node`] for values that the application itself decides on. Where the
+    /// flash is locked (a sealed program) the device restarts to store them, if it [may
+    /// leave](Self::asking).
     ///
     /// # Errors
     /// As for [`confirm`](Self::confirm).
@@ -409,9 +409,9 @@ impl ProgramControl {
         self.permits().then(|| self.nmt_reset(now)).ok_or(Abort::DEVICE_STATE)
     }
 
-    /// An NMT reset node command came, which is not refused (CiA 301). The device restarts as after a
-    /// power-on, so that the bootloader counts no crash. A lift that has its password goes into the
-    /// bootloader.
+    /// An NMT reset node command came, which is not refused (CiA 301). The device restarts as after
+    /// a power-on, so that the bootloader counts no crash. A lift that has its password goes into
+    /// the bootloader.
     pub fn nmt_reset(&mut self, now: u32) {
         let request = self.refused.unwrap_or(BootRequest::PowerOn);
         self.leave(if self.armed { BootRequest::Stay } else { request }, now);
@@ -442,11 +442,10 @@ impl ProgramControl {
 
     /// The device restarts to store something, if the application permits it.
     fn restart_with(&mut self, request: BootRequest, now: u32) -> Result<(), Abort> {
-        if self.permits() {
-            self.promise(request, now)
-        } else {
-            Err(Abort::DEVICE_STATE)
+        if !self.permits() {
+            return Err(Abort::DEVICE_STATE);
         }
+        self.promise(request, now)
     }
 
     /// The device leaves with this request, unless it was promised to leave with another one.
@@ -704,8 +703,9 @@ mod tests {
         assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Confirm(1)));
     }
 
-    /// Nothing has happened after a no, and nothing is owed, however often a master asks; an NMT reset is
-    /// not refused (CiA 301). A bootloader that is older than the rescue request would count a crash.
+    /// Nothing has happened after a no, and nothing is owed, however often a master asks; an NMT
+    /// reset is not refused (CiA 301). A bootloader that is older than the rescue request would
+    /// count a crash.
     #[test]
     fn an_application_that_may_not_leave_stays_and_gets_the_rescue_window() {
         let refused = |code| Err(CallgateError::Refused(code));
@@ -746,8 +746,8 @@ mod tests {
         assert_eq!((services.confirmed, services.unconfirmed), (1, 2));
     }
 
-    /// It is asked once, before an answer is withheld. Where the client wrote in segments the answer cannot
-    /// be: STOP is a call then, and a CLEAR that is refused takes the yes back.
+    /// It is asked once, before an answer is withheld. Where the client wrote in segments the
+    /// answer cannot be: STOP is a call then, and a CLEAR that is refused takes the yes back.
     #[test]
     fn a_yes_is_final() {
         for value in [0x80, 0, 2, 3] {

@@ -183,8 +183,8 @@ impl Responder {
         &mut self.control
     }
 
-    /// Whether the device is about to leave ([`ProgramControl::leaving`]): what stands must not start to
-    /// move.
+    /// Whether the device is about to leave ([`ProgramControl::leaving`]): what stands must not
+    /// start to move.
     #[must_use]
     pub fn leaving(&self) -> bool {
         self.control.leaving()

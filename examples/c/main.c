@@ -62,9 +62,9 @@ const struct object objects[] = {
 /* ---- Program control ---- */
 
 /* Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
- * command is answered: 1F51h = 80h, 0, 2 and 3. A machine that moves answers false, and the command is
- * refused. After true the reset follows within half a second: until then nothing may start to move that
- * stands (coboot_program_leaving).
+ * command is answered: 1F51h = 80h, 0, 2 and 3. A machine that moves answers false, and the command
+ * is refused. After true the reset follows within half a second: until then nothing may start to
+ * move that stands (coboot_program_leaving).
  */
 static bool may_leave(void)
 {

@@ -13,9 +13,10 @@ COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);
 // What coboot knows of this program.
 coboot_program program;
 
-// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a command is answered: 1F51h = 80h,
-// 0, 2 and 3. A machine that moves answers false, and the command is refused. After true the reset follows within half a second:
-// until then nothing may start to move that stands (coboot_program_leaving).
+// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
+// command is answered: 1F51h = 80h, 0, 2 and 3. A machine that moves answers false, and the command
+// is refused. After true the reset follows within half a second: until then nothing may start to
+// move that stands (coboot_program_leaving).
 static bool may_leave()
 {
     return true;

@@ -58,10 +58,10 @@ pub enum Selector {
     /// Withdraws a program's release for autostart, like 1F51h = 84h. Takes [`ProgramArgs`] and
     /// only uses the number.
     Invalidate = 6,
-    /// Takes back that a program is confirmed, but not its release: it starts with its rescue window
-    /// until it has shown again that it can return. Takes [`ProgramArgs`] and only uses the number.
-    /// That of a sealed program is not stored ([`Status::Locked`]): its confirmation keeps older
-    /// images out, and no stranger may wear the flash out.
+    /// Takes back that a program is confirmed, but not its release: it starts with its rescue
+    /// window until it has shown again that it can return. Takes [`ProgramArgs`] and only uses the
+    /// number. That of a sealed program is not stored ([`Status::Locked`]): its confirmation keeps
+    /// older images out, and no stranger may wear the flash out.
     Unconfirm = 7,
 }
 

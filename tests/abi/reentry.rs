@@ -46,7 +46,8 @@ int main(int count, char **words)
 }
 "#;
 
-/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store node, rescue.
+/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store
+/// node, rescue.
 const REQUESTS: [u32; 7] = [1, 3, 5, 7, 10, 12, 15];
 const OWED: u32 = 7;
 const CONFIRM: u32 = 10;

@@ -53,7 +53,6 @@ fn application() -> Bench {
     bench
 }
 
-/// The address of a symbol of the application.
 fn symbol(name: &str) -> u32 {
     firmware::symbol(firmware::APP_DEBUGGER, |of| of == name)
 }

@@ -197,9 +197,10 @@ fn what_the_application_can_refuse_it_refuses_itself() {
     }
 }
 
-/// A machine that moves (08000022h, CiA 301 table 22): every command that would end in a reset is refused,
-/// and stores one value however often it comes. So that an application which refuses for ever does not
-/// lock itself in, the next start has the rescue window, by an NMT reset as after a power-off.
+/// A machine that moves (08000022h, CiA 301 table 22): every command that would end in a reset is
+/// refused, and stores one value however often it comes. So that an application which refuses for
+/// ever does not lock itself in, the next start has the rescue window, by an NMT reset as after a
+/// power-off.
 #[test]
 fn an_application_that_may_not_leave_stays_and_can_be_caught() {
     let nmt_reset: fn(&mut Bench) = |bench| bench.post(0, &[0x81, NODE]);

@@ -375,8 +375,8 @@ impl Bench {
         self.power_on();
     }
 
-    /// The boot-up messages after this start: one of the program, and one before it of the bootloader if
-    /// the program has a rescue window.
+    /// The boot-up messages after this start: one of the program, and one before it of the
+    /// bootloader if the program has a rescue window.
     pub fn boot_ups(&mut self, start: fn(&mut Self)) -> usize {
         let from = self.time();
         start(self);
@@ -385,8 +385,8 @@ impl Bench {
         frames.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).count()
     }
 
-    /// The machine of the running application moves from now on, or stands: of the template by the word of
-    /// its interlock, of the probe in C by its object.
+    /// The machine of the running application moves from now on, or stands: of the template by the
+    /// word of its interlock, of the probe in C by its object.
     ///
     /// # Panics
     /// If the application has no machine.

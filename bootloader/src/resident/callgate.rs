@@ -170,8 +170,8 @@ fn own_info(flash: &ResidentFlash, record: Option<RenewalRecord>) -> ProgramArgs
     }
 }
 
-/// Reports about a program, confirms it (which also signs it, so that it may start by itself), takes
-/// back both, or the confirmation alone. A confirmation clears the crash count.
+/// Reports about a program, confirms it (which also signs it, so that it may start by itself),
+/// takes back both, or the confirmation alone. A confirmation clears the crash count.
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
     if PRODUCT.renewal && number == BOOTLOADER && selector == Selector::ProgramInfo {

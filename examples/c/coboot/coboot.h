@@ -89,8 +89,9 @@ extern const struct coboot_label coboot_label_of_image;
 #define COBOOT_WARM_START_MAGIC UINT32_C(0x31574243)
 
 /* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, node
- * parameters what coboot_stored_node makes, and the others 0. Confirm, invalidate and store node are for what the
- * callgate answers with COBOOT_STATUS_LOCKED. Rescue starts as after a power-on, with the rescue window. */
+ * parameters what coboot_stored_node makes, and the others 0. Confirm, invalidate and store node
+ * are for what the callgate answers with COBOOT_STATUS_LOCKED. Rescue starts as after a power-on,
+ * with the rescue window. */
 #define COBOOT_REQUEST_STAY UINT32_C(0x1)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)
@@ -473,8 +474,8 @@ static inline int32_t coboot_invalidate(const struct coboot_callgate *gate, uint
     return coboot_call(gate, COBOOT_SELECTOR_INVALIDATE, &args);
 }
 
-/* Takes back that a program is confirmed, but not its signature: it starts with its rescue window. COBOOT_STATUS_LOCKED for
- * a sealed program, COBOOT_STATUS_UNKNOWN_SELECTOR of an older bootloader.
+/* Takes back that a program is confirmed, but not its signature: it starts with its rescue window.
+ * COBOOT_STATUS_LOCKED for a sealed program, COBOOT_STATUS_UNKNOWN_SELECTOR of an older bootloader.
  */
 static inline int32_t coboot_unconfirm(const struct coboot_callgate *gate, uint32_t number)
 {

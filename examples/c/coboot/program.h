@@ -61,16 +61,19 @@ struct coboot_program {
     uint8_t number;
     /* Services of the bootloader, or a null pointer. */
     const struct coboot_callgate *gate;
-    /* The rule of the application about leaving; set it after coboot_program_init. A null pointer: it always may.
+    /* The rule of the application about leaving; set it after coboot_program_init. A null pointer:
+     * it always may.
      *
-     * It is asked once before a command of 1F51h, or a request of the application itself, ends in a reset, and answers at
-     * once. False: the command is refused (COBOOT_ABORT_DEVICE_STATE), and nothing has changed. True is final: the reset
-     * follows, 500 ms later at most, and until then coboot_program_leaving is true: what stands must not start to move.
-     * An NMT reset is not refused, and does not ask.
+     * It is asked once before a command of 1F51h, or a request of the application itself, ends in a
+     * reset, and answers at once. False: the command is refused (COBOOT_ABORT_DEVICE_STATE), and
+     * nothing has changed. True is final: the reset follows, 500 ms later at most, and until then
+     * coboot_program_leaving is true: what stands must not start to move. An NMT reset is not
+     * refused, and does not ask.
      *
-     * An application that refuses for ever must not lock itself in. So the first refusal since its start takes back that
-     * it is confirmed, which writes flash as coboot_store_node does: the next start has the rescue window. Nothing is
-     * stored for a sealed program; it has the window after an NMT reset.
+     * An application that refuses for ever must not lock itself in. So the first refusal since its
+     * start takes back that it is confirmed, which writes flash as coboot_store_node does: the next
+     * start has the rescue window. Nothing is stored for a sealed program; it has the window after
+     * an NMT reset.
      */
     bool (*may_leave)(void);
 
@@ -100,28 +103,32 @@ uint32_t coboot_program_read(const struct coboot_program *program, uint16_t inde
 
 /* Handles an SDO download of the right size to one of these objects; one to 1F51h is a command.
  * Call it before the download is answered, and answer unless coboot_program_is_silent is true.
- * COBOOT_ABORT_DEVICE_STATE: the bootloader must be called first (80h), or the application may not leave now.
+ * COBOOT_ABORT_DEVICE_STATE: the bootloader must be called first (80h), or the application may not
+ * leave now.
  */
 uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t value,
                               uint32_t now_ms);
 
-/* Carries out NMT reset node, which is not refused (CiA 301): a reset that is not counted as a crash. It comes as soon as
- * all frames are on the bus.
+/* Carries out NMT reset node, which is not refused (CiA 301): a reset that is not counted as a
+ * crash. It comes as soon as all frames are on the bus.
  */
 void coboot_program_nmt_reset(struct coboot_program *program, uint32_t now_ms);
 
-/* The same reset as a request of the application itself. COBOOT_ABORT_DEVICE_STATE if it may not leave now. */
+/* The same reset as a request of the application itself. COBOOT_ABORT_DEVICE_STATE if it may not
+ * leave now.
+ */
 uint32_t coboot_program_restart(struct coboot_program *program, uint32_t now_ms);
 
-/* Confirms this program as a request of the application itself: it is good. Where the flash is locked (a sealed program),
- * the device restarts to store it, if it may leave. A program that has refused to leave is released by this, but keeps its
- * rescue window. COBOOT_ABORT_HARDWARE if the bootloader does not store it, COBOOT_ABORT_DEVICE_STATE if the device may not
- * leave now, or is about to leave for another reason.
+/* Confirms this program as a request of the application itself: it is good. Where the flash is
+ * locked (a sealed program), the device restarts to store it, if it may leave. A program that has
+ * refused to leave is released by this, but keeps its rescue window. COBOOT_ABORT_HARDWARE if the
+ * bootloader does not store it, COBOOT_ABORT_DEVICE_STATE if the device may not leave now, or is
+ * about to leave for another reason.
  */
 uint32_t coboot_program_confirm(struct coboot_program *program, uint32_t now_ms);
 
-/* Stores node-ID (255 for none) and bit rate in bit/s as a request of the application itself, with a restart and the
- * results of coboot_program_confirm.
+/* Stores node-ID (255 for none) and bit rate in bit/s as a request of the application itself, with
+ * a restart and the results of coboot_program_confirm.
  */
 uint32_t coboot_program_store_node(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate, uint32_t now_ms);
 

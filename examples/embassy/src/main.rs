@@ -38,9 +38,10 @@ const TICK: Duration = Duration::from_millis(2);
 static LAYOUT: Layout = coboot_app::layout!();
 coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);
 
-/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
-/// answered. A machine that moves says no, and the command is refused (08000022h). After a yes no task may
-/// start what stands (`Responder::leaving`); app-template shows how they exclude each other.
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a
+/// command is answered. A machine that moves says no, and the command is refused (08000022h). After
+/// a yes no task may start what stands (`Responder::leaving`); app-template shows how they exclude
+/// each other.
 fn may_leave() -> bool {
     true
 }

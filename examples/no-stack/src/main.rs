@@ -120,8 +120,8 @@ fn main() -> ! {
     }
 }
 
-/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
-/// answered. A machine that moves says no, and the command is refused (08000022h).
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a
+/// command is answered. A machine that moves says no, and the command is refused (08000022h).
 fn may_leave() -> bool {
     true
 }

@@ -13,9 +13,9 @@ use crate::stack::{AbortCode, Confirmation, Dictionary, Value};
 /// 2000h, an object of the application: half the period of the LED, in ms.
 pub static BLINK_MS: AtomicU16 = AtomicU16::new(500);
 
-/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a command is
-/// answered. A machine that moves says no, and the command is refused (08000022h). After a yes
-/// `ProgramControl::leaving` is true until the reset, and what stands must not start to move.
+/// Whether the device may leave now, for its bootloader or for a reset: asked once, before a
+/// command is answered. A machine that moves says no, and the command is refused (08000022h). After
+/// a yes `ProgramControl::leaving` is true until the reset, and what stands must not start to move.
 fn may_leave() -> bool {
     true
 }
