@@ -94,7 +94,7 @@ pub enum BootRequest {
     RomLoader = 14,
     /// Start as after a power-on, with the rescue window of a program that was never confirmed: the
     /// program has refused to leave for the bootloader, and NMT reset node came.
-    Rescue = 15,
+    Rescue = 16,
 }
 
 /// A step in the trial of a new RAM image.
@@ -174,7 +174,8 @@ pub struct WarmStart {
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged, 9
     /// fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the
-    /// ROM, 15 as after a power-on with a rescue window; 0 none, which may have the mark.
+    /// ROM, 16 as after a power-on with a rescue window; 0 none, which may have the mark. 15 is kept
+    /// for the installation of a stored program.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
@@ -215,7 +216,7 @@ impl WarmStart {
             }
             BootRequest::Renewal(step) => (13, step as u32),
             BootRequest::RomLoader => (14, 0),
-            BootRequest::Rescue => (15, 0),
+            BootRequest::Rescue => (16, 0),
         };
         Self::encode(request, argument)
     }
@@ -252,7 +253,7 @@ impl WarmStart {
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
             (13, ..=0xFF) => BootRequest::Renewal(TrialStep::from_number(program)?),
             (14, 0) => BootRequest::RomLoader,
-            (15, 0) => BootRequest::Rescue,
+            (16, 0) => BootRequest::Rescue,
             _ => return None,
         })
     }

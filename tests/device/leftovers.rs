@@ -375,7 +375,6 @@ fn a_program_that_leaves_the_caches_of_the_flash_on_does_no_harm() {
 /// The main job after a jump of this program; none of these bits of a register may be left set by it.
 fn plays_the_main_job_after(wrong: &Wrong, register: u32, bits: u32) {
     let mut bench = board_with(wrong);
-    bench.run_ms(100);
     bench.fill_journal(0);
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1_000);

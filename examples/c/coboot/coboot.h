@@ -100,7 +100,7 @@ extern const struct coboot_label coboot_label_of_image;
 #define COBOOT_REQUEST_CONFIRM UINT32_C(0xA)
 #define COBOOT_REQUEST_INVALIDATE UINT32_C(0xB)
 #define COBOOT_REQUEST_STORE_NODE UINT32_C(0xC)
-#define COBOOT_REQUEST_RESCUE UINT32_C(0xF)
+#define COBOOT_REQUEST_RESCUE UINT32_C(0x10)
 
 struct coboot_warm_start {
     uint32_t magic;
