@@ -374,9 +374,10 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, damage)));
     bench.power_off();
-    // The image itself, for comparison.
+    // The image itself, for comparison: it makes room, and then the program starts.
     load(&mut bench, &Parts::of(firmware::BOOTLOADER));
     bench.power_on();
+    bench.await_boot_up(1000);
     bench.await_boot_up(1000);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
