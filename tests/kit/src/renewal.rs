@@ -38,7 +38,8 @@ pub const PLACES: Places = match Places::of(&LAYOUT) {
 
 pub const BOARD: u32 = 0x1234_5678;
 /// What the resident part has.
-pub const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: Abilities::RENEWAL, facts: 0 };
+pub const HOST: Host =
+    Host { board: BOARD, services: SERVICES_VERSION, features: Abilities::RENEWAL, facts: 0 };
 pub const RENEWAL: Renewal = Renewal {
     board: BOARD,
     features: Abilities::RENEWAL,

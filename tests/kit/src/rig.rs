@@ -15,11 +15,11 @@ use canopen::device::Device;
 use canopen::lss::LssDevice;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
+use shared_abi::abilities::Abilities;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
-use shared_abi::abilities::Abilities;
 use shared_abi::ram_image::Host;
 use shared_abi::renewal::word;
 use shared_abi::warm_start::BootRequest;
@@ -114,7 +114,8 @@ const fn config(
 
 /// A renewal of the bootloader by an image of any vendor.
 const RENEWAL: Renewal = Renewal { identity: None, ..renewal::RENEWAL };
-const SEALED_RENEWAL: Renewal = Renewal { features: Abilities::RENEWAL.with(Abilities::SEALED, true), ..RENEWAL };
+const SEALED_RENEWAL: Renewal =
+    Renewal { features: Abilities::RENEWAL.with(Abilities::SEALED, true), ..RENEWAL };
 
 /// A profile with the renewal of the bootloader, which has this program number.
 const fn renews(profile: Profile, number: u8) -> Profile {
