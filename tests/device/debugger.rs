@@ -689,7 +689,7 @@ fn coflash_debug_tells_what_a_device_lacks() {
     endpoint.bench.machine().set_read_protection(0);
     let (code, _, err) = debug(&mut endpoint, &["read", "0x20000000"]);
     assert!(code == Some(6) && err.contains("the device is secured"), "{err}");
-    let mut bench = Bench::new().switched_on();
+    let bench = Bench::new().switched_on();
     let (code, _, err) = debug(&mut Endpoint::new(bench), &["read", "0x20000000"]);
     assert!(code == Some(6) && err.contains("no debugger interface"), "{err}");
 }

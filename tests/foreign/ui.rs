@@ -115,7 +115,7 @@ fn a_service_station_is_readable_in_both_languages() {
 
 #[test]
 fn the_emulated_board_is_updated_by_dropping_an_elf() {
-    let mut bench = Bench::new().switched_on();
+    let bench = Bench::new().switched_on();
     let mut endpoint = Endpoint::new(bench);
     let (mut command, _folder) = script("emulated");
     command.args(["--bus", &endpoint.url(), "--image"]).arg(firmware::dir().join(firmware::APP_V1));

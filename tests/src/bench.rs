@@ -359,15 +359,6 @@ impl Bench {
         self
     }
 
-    /// Installs a program, without a trial.
-    ///
-    /// # Panics
-    /// If it is no good program.
-    pub fn install(&mut self, image: &str) {
-        let options = FlashOptions::default().trial_run(false);
-        flash(&mut self.session(), &firmware::blocks(image), &options, &mut |_| {}).expect("a good program");
-    }
-
     /// Switches the power off for 100 ms, and on.
     pub fn power_cycle(&mut self) {
         self.power_off();

@@ -29,7 +29,7 @@ fn the_recorded_update_is_what_the_tool_prints() {
 
     let coflash = env::var("COBOOT_COFLASH").expect("COBOOT_COFLASH; cargo xtask test sets it");
     let images = env::var("COBOOT_FIRMWARE_DIR").expect("COBOOT_FIRMWARE_DIR; cargo xtask test sets it");
-    let mut bench = Bench::new().switched_on();
+    let bench = Bench::new().switched_on();
     let mut endpoint = Endpoint::new(bench);
     // The tool runs in real time: on a busy host an answer may come late, and a block that is sent again is
     // no part of the recording.

@@ -17,7 +17,6 @@ use crate::rig::go_on;
 pub use crate::rig::{block, crc32};
 
 use crate::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
-pub use crate::rig::{block, crc32};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
 pub static LAYOUT_REF: &Layout = &LAYOUT;
