@@ -48,7 +48,7 @@ int main(int count, char **words)
 
 /// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store
 /// node, rescue.
-const REQUESTS: [u32; 7] = [1, 3, 5, 7, 10, 12, 15];
+const REQUESTS: [u32; 7] = [1, 3, 5, 7, 10, 12, 16];
 const OWED: u32 = 7;
 const CONFIRM: u32 = 10;
 
@@ -72,7 +72,7 @@ impl Model {
             departure.begin_silent(request, now);
             self.silent = true;
         } else {
-            departure.begin(request, !matches!(request, 3 | 5 | 15), now);
+            departure.begin(request, !matches!(request, 3 | 5 | 16), now);
         }
         self.confirms |= request == CONFIRM;
         true

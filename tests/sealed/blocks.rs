@@ -232,6 +232,9 @@ fn a_client_that_comes_back_goes_on_with_the_next_block() {
             let end = before.flash_address + before.size;
             assert_eq!(begun(&mut bench), (control_crc, end), "before block {at}");
             assert_eq!(send(&mut bench, &others[0]), status::SEQUENCE, "the blocks of another file");
+            assert_eq!(begun(&mut bench).0, 0, "nothing goes on after a refusal");
+            assert_eq!(send(&mut bench, &blocks[0]), status::SEQUENCE, "so it does not begin again");
+            assert_eq!(send(&mut bench, &blocks[at - 1]), status::OK, "the last block once more");
             assert_eq!(send(&mut bench, &blocks[0]), status::OK, "the same file again");
             assert_eq!(begun(&mut bench), (control_crc, end));
             // The client is not sure where it was.

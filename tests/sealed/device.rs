@@ -16,7 +16,7 @@ use coboot_tests::sealed_board::{
 };
 use coflash_core::device::access::{ask, challenge, events};
 use coflash_core::device::debugger::Debugger;
-use coflash_core::device::{Doing, Transfers};
+use coflash_core::device::Transfers;
 use coflash_core::file::block_file::emit;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
 use kit::rig::crc32;
@@ -287,9 +287,8 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
         before.tbs(0, 0, 0),
         "a nonce is used once"
     );
-    // The second one since the first block, so it erases at once.
-    bench.session().command(1, ProgramControl::Clear).unwrap();
-    bench.session().await_idle(1, Doing::Command(ProgramControl::Clear)).unwrap();
+    // The refused one ended the row: only a second one from here erases at once.
+    clear_twice(&mut bench).unwrap();
     assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), 0, "erased");
 
     bench.power_cycle();
