@@ -127,7 +127,7 @@ impl Model {
     fn rot(&mut self, at: usize, bits: u8) {
         let seen = self.look();
         let place = match (seen.state(), seen.origin) {
-            (State::Installed, Origin::Home) if seen.is_staged && at % 2 == 0 => HOME,
+            (State::Installed, Origin::Home) if seen.is_staged && at.is_multiple_of(2) => HOME,
             (State::Staged, Origin::Home | Origin::Trial) | (State::Installed, Origin::Home) => STAGING,
             _ => return,
         };

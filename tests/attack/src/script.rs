@@ -75,7 +75,7 @@ impl Script {
                 let block = random.chance(60).then(|| random.below(3));
                 let bytes = random.chance(60).then(|| random.below(1500));
                 self.actions.push(Action::Send { sub, content, block, bytes });
-                self.actions.extend((seed % 3 == 0).then_some(Action::Cancel));
+                self.actions.extend(seed.is_multiple_of(3).then_some(Action::Cancel));
             }
             8 => self.actions.push(Action::Wait(random.pick(&[1, 1000, 40_000, 60_000]))),
             9 => self.actions.push(Action::Store(1 + (seed % 127) as u8)),
@@ -87,7 +87,7 @@ impl Script {
             15 => self.reset(Action::Rot(seed as usize, (seed >> 32) as u8)),
             16 => self.go_on(),
             _ => {
-                let image = if seed % 4 == 0 { image } else { Content::Image(1) };
+                let image = if seed.is_multiple_of(4) { image } else { Content::Image(1) };
                 self.actions.extend(self.is_locked.then_some(Action::Password { sub: own }));
                 if self.random.chance(40) {
                     let trouble = self.random.pick(&[Trouble::Dip, fails]);

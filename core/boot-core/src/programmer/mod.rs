@@ -12,7 +12,7 @@
 //! before: a refusal or an abort until then has no effect on the old program.
 //!
 //! Staging is the end of the last program's flash and the place of a new RAM image, so there two
-//! records can stand in the way. [`Programmer::may_take`] is the rule for it.
+//! records can be in the way. [`Programmer::may_take`] is the rule for it.
 
 mod install;
 mod write;
