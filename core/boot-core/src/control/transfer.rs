@@ -8,13 +8,17 @@ use shared_abi::ram_image::Host;
 
 use super::{find, Downloader, Failure, Transfer};
 use crate::flash::Flash;
-use crate::intake::{Destination, Findings, Intake};
+use crate::intake::{Destination, Findings, Intake, Takes};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::{LastBlock, Session, ANY};
 use crate::store::Parameters;
 use crate::unseal::Place;
+
+impl<P: Parameters> Takes for P {
+    const INTEL_HEX: bool = P::INTEL_HEX;
+}
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// 1F50h: the client starts a transfer, with its size if it is known.

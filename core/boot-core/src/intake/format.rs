@@ -5,7 +5,6 @@ use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
-use crate::store::Parameters;
 
 /// At least the first two vectors: a program whose CRC does not cover them cannot start.
 pub(crate) const SMALLEST_PROGRAM: u32 = 8;
@@ -20,6 +19,12 @@ pub(crate) enum Recognition<T> {
     Yes(T),
 }
 
+/// Which formats a device takes, besides those that each one takes.
+pub(crate) trait Takes {
+    /// Intel HEX. Without it, the compiler leaves out the code.
+    const INTEL_HEX: bool;
+}
+
 /// A format of programs.
 pub(crate) trait Format: Sized {
     /// Whether it carries a whole program in one transfer. Such a client is slowed down if the
@@ -27,7 +32,7 @@ pub(crate) trait Format: Sized {
     const IS_STREAM: bool;
 
     /// Whether the device takes the format. Without it, the compiler leaves out the code.
-    fn is_taken<P: Parameters>() -> bool {
+    fn is_taken<T: Takes>() -> bool {
         true
     }
 

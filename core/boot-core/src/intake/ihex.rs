@@ -7,12 +7,11 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
-use super::format::{Destination, Format, Recognition};
+use super::format::{Destination, Format, Recognition, Takes};
 use super::stream::Stream;
 use crate::policy::Judge;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
-use crate::store::Parameters;
 
 /// A program in Intel HEX.
 pub(super) struct IntelHex {
@@ -23,8 +22,8 @@ pub(super) struct IntelHex {
 impl Format for IntelHex {
     const IS_STREAM: bool = true;
 
-    fn is_taken<P: Parameters>() -> bool {
-        P::INTEL_HEX
+    fn is_taken<T: Takes>() -> bool {
+        T::INTEL_HEX
     }
 
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {

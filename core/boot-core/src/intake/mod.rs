@@ -24,8 +24,7 @@ use canopen::AbortCode;
 use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::store::Parameters;
-pub(crate) use format::{Destination, Findings, Format, Recognition};
+pub(crate) use format::{Destination, Findings, Format, Recognition, Takes};
 
 formats! {
     Sealed(sealed::SealedImage),
@@ -59,7 +58,7 @@ impl Intake {
     }
 
     /// Takes the next bytes.
-    pub(crate) fn data<P: Parameters>(
+    pub(crate) fn data<T: Takes>(
         &mut self,
         mut bytes: &[u8],
         to: &mut Destination<'_, '_>,
@@ -70,18 +69,18 @@ impl Intake {
             *len += more;
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
-            let Some(mut known) = Known::recognise::<P>(&first[..len], &to.judge)? else { return Ok(()) };
+            let Some(mut known) = Known::recognise::<T>(&first[..len], &to.judge)? else { return Ok(()) };
             if to.judge.images.only_sealed().is_some()
                 && !matches!(known, Known::Sealed(_) | Known::BlockFile(_))
             {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;
-            known.data::<P>(&first[..len], to)?;
+            known.data::<T>(&first[..len], to)?;
             self.state = State::Known(known);
         }
         match &mut self.state {
-            State::Known(known) if !bytes.is_empty() => known.data::<P>(bytes, to),
+            State::Known(known) if !bytes.is_empty() => known.data::<T>(bytes, to),
             _ => Ok(()),
         }
     }
@@ -128,10 +127,10 @@ macro_rules! formats {
 
         impl Known {
             /// `None` if there are too few bytes to decide.
-            fn recognise<P: Parameters>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
+            fn recognise<T: Takes>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
                 let mut more = false;
                 $(match <$format>::recognise(first, judge) {
-                    Recognition::Yes(format) if <$format>::is_taken::<P>() => return Ok(Some(Self::$name(format))),
+                    Recognition::Yes(format) if <$format>::is_taken::<T>() => return Ok(Some(Self::$name(format))),
                     Recognition::More => more = true,
                     Recognition::Yes(_) | Recognition::No => {}
                 })*
@@ -155,13 +154,13 @@ macro_rules! formats {
                 }
             }
 
-            fn data<P: Parameters>(
+            fn data<T: Takes>(
                 &mut self,
                 bytes: &[u8],
                 to: &mut Destination<'_, '_>,
             ) -> Result<(), Refusal> {
                 match self {
-                    $(Self::$name(format) if <$format>::is_taken::<P>() => format.data(bytes, to),)*
+                    $(Self::$name(format) if <$format>::is_taken::<T>() => format.data(bytes, to),)*
                     _ => Err(to.judge.unknown_format()),
                 }
             }
