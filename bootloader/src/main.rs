@@ -327,15 +327,9 @@ mod app {
                 while let Some(frame) = next {
                     log::received(&frame);
                     // The filters pass only NMT and frames for this device or for layer setting
-                    // services (LSS). All but NMT, and what is not answered, end the rescue window. A
-                    // master that greets each device after its boot-up must not keep the program from
-                    // starting: while the store is compacted, only 1F50h and 1F51h do.
+                    // services (LSS). All but NMT, and what is not answered, end the rescue window.
                     let is_window = held.is_some_and(|(_, ms)| ms > 0);
-                    let is_control = matches!(frame.exactly::<8>(), Some([_, 0x50 | 0x51, 0x1F, ..]));
-                    if frame.cob_id() != Some(CobId::NMT)
-                        && !slave.ignores(&frame)
-                        && (is_window || is_control)
-                    {
+                    if is_window && frame.cob_id() != Some(CobId::NMT) && !slave.ignores(&frame) {
                         *held = None;
                     }
                     if slave.handle(&frame, now, device) {
@@ -346,6 +340,11 @@ mod app {
                     next = to_handle.dequeue();
                 }
             });
+            // A master that greets each device after its boot-up must not keep the program from starting
+            // while the store is compacted. One that wants to download does.
+            if bootloader.is_asked() {
+                *held = None;
+            }
             if let Some(request) = bootloader.take_boot_request() {
                 // A trial ends also if nobody acknowledges a frame: the bit rate of the image may be wrong.
                 let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);

@@ -21,6 +21,9 @@ pub enum CrcUnit {
     Taken,
 }
 
+/// Whether an application's CRC is computed by the unit. The compact map has no room for that, and computes it in
+/// software.
+const SHARES_CRC_UNIT: bool = LAYOUT.home.is_some();
 /// The bytes whose CRC is computed while the interrupts of an application wait: some 50 us at 16 MHz.
 const SHARED_STEP: u32 = 512;
 
@@ -115,7 +118,7 @@ impl Flash for ResidentFlash {
     fn crc32(&self, mut crc: u32, region: Region) -> u32 {
         let (mut address, end) = (region.base, region.end());
         let is_fit = address.is_multiple_of(4) && FLASH.contains(address, region.size);
-        if is_fit && self.crc_unit == CrcUnit::Shared {
+        if SHARES_CRC_UNIT && is_fit && self.crc_unit == CrcUnit::Shared {
             return Self::crc32_by_parts(crc, region);
         }
         if is_fit && self.crc_unit == CrcUnit::Own {

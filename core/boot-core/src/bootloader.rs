@@ -230,6 +230,8 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Cho
     signatures: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
+    /// 1F50h or 1F51h was written since the start.
+    is_asked: bool,
     /// From this time on the device is idle, unless there is work on the flash before it.
     idle_at: Instant,
     stored_version: StoredVersion,
@@ -272,6 +274,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
             lock: Lock::new(config.password),
             signatures: Lock::new(b""),
             now: Instant::from_millis(0),
+            is_asked: false,
             idle_at: Instant::from_millis(IDLE_MS),
             stored_version: StoredVersion::new(),
             choices: PhantomData,
@@ -379,6 +382,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// # Errors
     /// The abort for the client.
     pub fn command(&mut self, sub: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        self.is_asked = true;
         self.download.command(Self::program(sub), command)
     }
 
@@ -386,6 +390,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
+    }
+
+    /// Whether 1F50h or 1F51h was written since the start: a master is at work.
+    #[must_use]
+    pub fn is_asked(&self) -> bool {
+        self.is_asked
     }
 
     /// Whether the store is being compacted, or may have to be before a program starts.
@@ -522,6 +532,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
+        self.is_asked = true;
         if C::EXTRAS.sealed && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now)
         {
             return Err(AbortCode::DEVICE_STATE);
