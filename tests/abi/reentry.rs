@@ -15,7 +15,17 @@ use kit::random::Random;
 const HARNESS: &str = r#"
 #include <stdio.h>
 #include "coboot.h"
-#include "reentry.h"
+
+/* What coboot.h has for the chip alone. */
+#define coboot_callgate() NULL
+#define coboot_read_handoff(handoff) ((void)(handoff), false)
+#define coboot_nameplate(handoff) NULL
+#define coboot_program_info(gate, number, info) ((void)(number), (void)(info), COBOOT_STATUS_FAILED)
+#define coboot_confirm(gate, number) COBOOT_STATUS_FAILED
+#define coboot_unconfirm(gate, number) COBOOT_STATUS_FAILED
+#define coboot_store_node(gate, node_id, bit_rate) COBOOT_STATUS_FAILED
+#define coboot_reset(request, argument) printf("%u %u", request, argument)
+#include "program.c"
 
 int main(int count, char **words)
 {
@@ -32,24 +42,34 @@ int main(int count, char **words)
             const struct coboot_reentry none = { 0 };
             reentry = none;
         } else if (event == 'b') {
-            puts(coboot_reentry_begin(&reentry, (uint32_t)what, 7, (uint32_t)now) ? "taken" : "refused");
+            const uint32_t argument = coboot_owed(1, 0, (uint8_t)(what >> 8));
+            const bool possible = coboot_reentry_begin(&reentry, what & 0xFF, argument, (uint32_t)now);
+            puts(possible ? "taken" : "refused");
         } else {
             const enum coboot_next next = coboot_reentry_proceed(&reentry, what != 0, (uint32_t)now);
             if (next == COBOOT_LEAVE) {
-                printf("leave %lu\n", (unsigned long)reentry.request);
+                printf("leave %u\n", reentry.request | (uint32_t)coboot_owed_node(reentry.argument) << 8);
             } else {
                 puts(next == COBOOT_SERVE ? "serve" : "wait");
             }
         }
     }
+    /* STOP, where the bootloader cannot answer. */
+    struct coboot_program stopped;
+    coboot_program_init(&stopped, 1, 0);
+    coboot_program_write(&stopped, COBOOT_PROGRAM_CONTROL, 1, 0, 0);
+    printf(coboot_program_is_silent(&stopped) ? "silent " : "answers ");
+    coboot_program_proceed(&stopped, false, 500);
     return 0;
 }
 "#;
 
-/// Requests of the warm-start cell by their numbers: stay, start, power-on, owed, confirm, store
-/// node, rescue.
-const REQUESTS: [u32; 7] = [1, 3, 5, 7, 10, 12, 16];
-const OWED: u32 = 7;
+/// Requests of the warm-start cell by their numbers: stay, start, power-on, an answer that is owed
+/// (for node 5), a STOP that was answered, confirm, store node, rescue.
+const REQUESTS: [u32; 8] = [STAY, 3, 5, OWED, STOPPED, CONFIRM, 12, 16];
+const STAY: u32 = 1;
+const OWED: u32 = 5 << 8 | STOPPED;
+const STOPPED: u32 = 7;
 const CONFIRM: u32 = 10;
 
 /// What an application on `Departure` does: the rules that are outside of it are those of
@@ -60,6 +80,7 @@ struct Model {
     /// What it leaves with, as far as is known.
     confirms: bool,
     silent: bool,
+    stopped: bool,
 }
 
 impl Model {
@@ -72,7 +93,9 @@ impl Model {
             departure.begin_silent(request, now);
             self.silent = true;
         } else {
+            let request = if request == STAY && self.stopped { STOPPED } else { request };
             departure.begin(request, !matches!(request, 3 | 5 | 16), now);
+            self.stopped = request == STOPPED || self.stopped && matches!(request, 3 | 5 | 16);
         }
         self.confirms |= request == CONFIRM;
         true
@@ -128,12 +151,15 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
     clang.args(["-std=c11", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]);
     clang.args(["-fsanitize=undefined", "-fsanitize-trap=undefined"]);
     clang.arg("-I").arg(&library).arg(&source).arg(library.join("reentry.c")).arg("-o").arg(&program);
+    clang.args(["-no-pie", "-Wl,--defsym=__programs=1"]);
     let output = clang.output().expect("`cargo xtask setup` installs clang");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let output = Command::new(&program).arg(&events).output().expect("it was just built");
     assert!(output.status.success());
     let told = String::from_utf8(output.stdout).unwrap();
-    let told: Vec<_> = told.lines().collect();
+    let mut told: Vec<_> = told.lines().collect();
+    // As `coboot_app::ProgramControl`: owed by program 1, for no node.
+    assert_eq!(told.pop(), Some("answers 7 1"));
     assert_eq!(told.len(), expected.len());
     let differs = told.iter().zip(&expected).position(|(c, rust)| c != rust);
     assert_eq!(differs, None, "event {differs:?}: C {:?}", differs.map(|at| (told[at], &expected[at])));

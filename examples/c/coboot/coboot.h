@@ -115,11 +115,18 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, argument) == 8, "coboot_
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
 
 /* The argument of COBOOT_REQUEST_OWED: node `node_id` was written `value` (0 STOP or 3 CLEAR) to 1F51h, sub-index `program`,
- * and has not answered. The bootloader serves the request after its boot-up, if it comes up with this node-ID.
+ * and has not answered. The bootloader serves the request after its boot-up, if it comes up with this node-ID. 0: the
+ * program has answered STOP itself, and the bootloader counts it as its own.
  */
 static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_id)
 {
     return program | (uint32_t)value << 8 | (uint32_t)node_id << 16;
+}
+
+/* The node-ID in it. */
+static inline uint8_t coboot_owed_node(uint32_t argument)
+{
+    return (uint8_t)(argument >> 16);
 }
 
 /* The argument of COBOOT_REQUEST_STORE_NODE: node-ID (255 for none) and bit rate in bit/s, as in coboot_store_node. */
@@ -484,8 +491,8 @@ static inline int32_t coboot_unconfirm(const struct coboot_callgate *gate, uint3
 }
 
 /* Leaves a request for the bootloader and resets the chip. What asked for it is answered before: wait until the answer is
- * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED does so
- * at once, and has not answered.
+ * on the bus, then 10 ms in which requests are served. Who leaves with COBOOT_REQUEST_OWED and a
+ * node-ID does so at once, and has not answered.
  */
 COBOOT_NORETURN static inline void coboot_reset(uint32_t request, uint32_t argument)
 {

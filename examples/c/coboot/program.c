@@ -224,13 +224,14 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
     case STOP:  /* The bootloader runs instead. */
     case CLEAR: /* The bootloader carries it out. */
         /* Masters send the next request at once after the answer, so the bootloader must send this
-         * answer.
+         * answer. If it cannot, STOP is a call, which it counts (node-ID 0).
          */
-        if (program->bootloader_answers) {
-            const uint32_t owed = coboot_owed(sub, (uint8_t)value, program->node_id);
+        if (program->bootloader_answers || value == STOP) {
+            const uint8_t node_id = program->bootloader_answers ? program->node_id : 0;
+            const uint32_t owed = coboot_owed(sub, (uint8_t)value, node_id);
             return leave_for_master(program, COBOOT_REQUEST_OWED, owed, now_ms);
         }
-        return value == STOP ? leave_for_master(program, COBOOT_REQUEST_STAY, 0, now_ms) : COBOOT_ABORT_DEVICE_STATE;
+        return COBOOT_ABORT_DEVICE_STATE;
     case RESET_STAT: /* CiA 302-3: reset program, which starts it anew. */
         return own ? leave_for_master(program, COBOOT_REQUEST_START, sub, now_ms) : COBOOT_ABORT_DEVICE_STATE;
     case START: /* It runs already; another one is the bootloader's to start. */

@@ -35,11 +35,13 @@ bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint
         || (!first && reentry->request == COBOOT_REQUEST_CONFIRM && request != COBOOT_REQUEST_CONFIRM)) {
         return false;
     }
-    if (first || is_promise(request) || !is_promise(reentry->request)) {
+    /* An answered STOP leads into the bootloader, too, which has to count it. */
+    const bool is_in_it = reentry->request == COBOOT_REQUEST_OWED && request == COBOOT_REQUEST_STAY;
+    if (first || (is_promise(request) && !is_in_it) || !is_promise(reentry->request)) {
         reentry->request = request;
         reentry->argument = argument;
     }
-    if (request == COBOOT_REQUEST_OWED) {
+    if (request == COBOOT_REQUEST_OWED && coboot_owed_node(argument) != 0) {
         reentry->silent = true;
         reentry->latest_ms = now_ms + OWED_MOST_MS;
         if (first) {

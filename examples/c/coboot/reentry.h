@@ -35,9 +35,9 @@ struct coboot_reentry {
     uint32_t pause_ends_ms, latest_ms;
 };
 
-/* Takes a command that makes the device leave. All requests but COBOOT_REQUEST_OWED are answered
- * first: this program serves for 10 ms after that answer. With COBOOT_REQUEST_OWED it sends nothing
- * any more.
+/* Takes a command that makes the device leave. All requests but COBOOT_REQUEST_OWED with a node-ID
+ * are answered first: this program serves for 10 ms after that answer. With an answer that the
+ * bootloader owes it sends nothing any more.
  *
  * An earlier promise to a master holds: a device that one master has called back comes up in the
  * bootloader, even if another master restarts it meanwhile, and a value to be stored is stored.
