@@ -268,6 +268,10 @@ impl Journal {
                     self.append()?;
                 }
                 (Err(FlashFault::Verify), _) => self.change_over()?,
+                // A compaction that fails is no reason to lose a record that came meanwhile.
+                (Err(_), Step::Erase | Step::Copy) if self.has_room() && self.storing.record[0] != ERASED => {
+                    self.storing.step = Step::Begin;
+                }
                 (Err(fault), _) => return Err(StoreError::Flash(fault)),
             }
         }
@@ -347,11 +351,18 @@ impl Journal {
 
     /// Continues with the first free slot, or with a region that has free slots.
     fn append(&mut self) -> Result<(), StoreError> {
-        if self.half_valid || self.free + SLOT_SIZE > self.valid.end() {
+        if !self.has_room() {
             return self.change_over();
         }
         self.write(Step::Append, self.free, self.storing.record);
         Ok(())
+    }
+
+    /// Whether a record may be added to the valid region.
+    fn has_room(&self) -> bool {
+        !self.half_valid
+            && matches!(self.header, Header::Found | Header::Firm)
+            && self.free + SLOT_SIZE <= self.valid.end()
     }
 
     /// Continues with the other region.

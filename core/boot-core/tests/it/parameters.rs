@@ -630,6 +630,22 @@ fn an_idle_bootloader_compacts_its_journal_and_takes_commands_meanwhile() {
     }
 }
 
+/// A sector that cannot be erased any more costs its erase, and no value as long as there is room.
+#[test]
+fn a_value_that_comes_during_a_compaction_which_fails_is_stored() {
+    for used in [256, 584, 585] {
+        let mut flash = used_slots(used);
+        let erase = flash.operations + 1;
+        flash.fail = Some((erase, FlashFault::Failed));
+        let mut bench = called_back(&mut flash, 0);
+        bench.node.step();
+        assert!(bench.node.is_compacting());
+        let room = used < 585;
+        assert_eq!(bench.command(CLR_SIGNATURE) == 0, room, "{used} used slots");
+        assert_eq!(ProgramRecord::load(&Journal::open(&flash, JOURNAL), &flash, 1).unwrap().signed, !room);
+    }
+}
+
 // --- flash that does not take everything
 
 /// A flash of which some places lose a bit of each word that is programmed.
