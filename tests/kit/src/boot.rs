@@ -70,6 +70,10 @@ impl<const RENEWS: bool, const RESUMES: bool> Parameters for Store<RENEWS, RESUM
         self.0.store(key, value);
     }
 
+    fn compact(&mut self, used: u32) -> bool {
+        self.0.compact(used)
+    }
+
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         self.0.next(flash, outcome)
     }
