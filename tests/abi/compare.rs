@@ -14,7 +14,10 @@ fn the_times_of_coboot_are_those_of_the_measurements() {
         let words: Vec<&str> = of_coboot.split([' ', ',', ';']).collect();
         for pair in words.windows(2).filter(|pair| ["s", "ms"].contains(&pair[1])) {
             let time = pair.join(" ");
-            assert!(BENCH.contains(&format!(" {time}")), "bench.md has no {time}: {row}");
+            // The table of starts is in ms.
+            let is_there = BENCH.contains(&format!(" {time}"))
+                || pair[1] == "ms" && BENCH.contains(&format!("| {} |", pair[0]));
+            assert!(is_there, "bench.md has no {time}: {row}");
             count += 1;
         }
     }
