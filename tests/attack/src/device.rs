@@ -1,25 +1,33 @@
 //! What can be done to a device, and what is found of it.
 
 use boot_core::flash::FlashFault;
-use boot_core::store::RenewalRecord;
+use boot_core::store::{NodeParameters, ProgramRecord, RenewalRecord};
+use canopen::AbortCode;
 use kit::model::Cut;
 use kit::rig::Setup;
+use shared_abi::geometry::Region;
 use shared_abi::renewal::{Origin, State};
+use shared_abi::warm_start::BootRequest;
 
-use crate::files::Content;
+use crate::files::{Content, Flaw, Part, Sent};
 
 /// What is done to a device.
 #[derive(Clone, Copy, Debug)]
 pub enum Action {
     /// 1F51h.
     Command { sub: u8, value: u8 },
-    /// The right password of this sub-index, if the device has one.
-    Password { sub: u8 },
-    /// A transfer to 1F50h: one block of a block file, or all of it as a stream; with `bytes` so many alone, and the
-    /// transfer stays open.
-    Send { sub: u8, content: Content, block: Option<usize>, bytes: Option<usize> },
+    /// The password of this sub-index, if the device has one: the right one, or another.
+    Password { sub: u8, is_right: bool },
+    /// A transfer to 1F50h. With `bytes` so many alone, and the transfer stays open.
+    Send { sub: u8, sent: Sent, is_announced: bool, bytes: Option<usize> },
+    /// So many more bytes of the open transfer; without a number all of them, and its end.
+    GoOn(Option<usize>),
     /// The open transfer is aborted.
     Cancel,
+    /// An object is read.
+    Read { index: u16, sub: u8 },
+    /// A program is read back from 1F50h, if the device permits it.
+    Upload { sub: u8 },
     /// LSS: this node-ID is stored.
     Store(u8),
     /// So many steps of the bootloader's own work.
@@ -42,6 +50,14 @@ pub enum Action {
     Renew(Content),
 }
 
+impl Action {
+    /// A whole transfer without a flaw.
+    #[must_use]
+    pub fn send(sub: u8, content: Content, part: Part) -> Self {
+        Self::Send { sub, sent: Sent { content, part, flaw: Flaw::None }, is_announced: true, bytes: None }
+    }
+}
+
 /// What happens in a flash operation.
 #[derive(Clone, Copy, Debug)]
 pub enum Trouble {
@@ -53,6 +69,8 @@ pub enum Trouble {
     Fail(FlashFault),
     /// It does a part, drawn by this seed, and says nothing.
     Weak(u64),
+    /// None: what was to come does not come.
+    None,
 }
 
 /// A program as a debug probe finds it.
@@ -66,7 +84,23 @@ pub enum Stored {
     Damaged,
 }
 
-/// A device as a debug probe finds it, if it were reset now.
+/// A program: as a debug probe finds it, and as the device tells it.
+#[derive(Clone, Copy, Debug)]
+pub struct Program {
+    pub stored: Stored,
+    /// Its record.
+    pub record: Option<ProgramRecord>,
+    /// 1F51h.
+    pub state: u32,
+    /// 1F56h.
+    pub crc: u32,
+    /// 1F57h.
+    pub status: u32,
+    /// Whether a part of its flash has the CRC of 1F56h, or none is told.
+    pub is_true: bool,
+}
+
+/// A device as a debug probe finds it, if it were reset now, and as it tells it.
 #[derive(Clone, Debug)]
 pub struct Seen {
     /// The resets so far.
@@ -82,7 +116,19 @@ pub struct Seen {
     /// Whether the whole image of this record is in staging.
     pub is_staged: bool,
     /// The programs, number 1 first.
-    pub programs: Vec<Stored>,
+    pub programs: Vec<Program>,
+    /// The stored node-ID and bit rate.
+    pub node: NodeParameters,
+    /// Whether the last values of LSS are stored, as the device says.
+    pub is_stored: bool,
+    /// What was written or erased since the last look.
+    pub touched: Vec<Region>,
+    /// For what it left the bootloader since the last look.
+    pub request: Option<BootRequest>,
+    /// The CRC of what the last action read back.
+    pub read_back: Option<u32>,
+    /// Whether there was no work at the end of the last action.
+    pub is_idle: bool,
     /// Whether no bit of the records is between 0 and 1, so that they read the same each time.
     pub is_certain: bool,
 }
@@ -91,15 +137,23 @@ impl Seen {
     pub fn state(&self) -> State {
         self.record.map_or(State::None, |record| record.state)
     }
+
+    /// The program with this number.
+    #[must_use]
+    pub fn program(&self, number: u8) -> Option<&Program> {
+        self.programs.get(usize::from(number).wrapping_sub(1))
+    }
 }
 
 /// A device that is attacked.
 pub trait Device {
     /// Its product.
     fn setup(&self) -> &'static Setup;
-    /// Carries out an action, and the resets that it leads to; whether the device has acknowledged it. (Not
-    /// [`Action::Renew`], which is several.)
-    fn act(&mut self, action: &Action) -> bool;
-    /// As a probe finds it. It changes nothing.
+    /// Carries out an action, and the resets that it leads to. (Not [`Action::Renew`], which is several.)
+    ///
+    /// # Errors
+    /// The abort with which the device has refused it; general error if the power was cut in it.
+    fn act(&mut self, action: &Action) -> Result<(), AbortCode>;
+    /// As a probe finds it. It changes nothing of it.
     fn look(&mut self) -> Seen;
 }

@@ -5,8 +5,9 @@ use std::collections::HashMap;
 use std::rc::Rc;
 
 use coflash_core::file::sealed::{key_block, Sealer, SigningKey};
+use kit::random::Random;
 use kit::renewal::{crc_of, image_of, BOARD, HOME, SOUND, STAGING};
-use kit::rig::{block, crc32, program, words, Setup, PRODUCT_CODE, VENDOR_ID};
+use kit::rig::{block, crc32, hex, program, words, Setup, PRODUCT_CODE, VENDOR_ID};
 use shared_abi::ram_image::Header;
 use shared_abi::renewal::BOOTLOADER;
 
@@ -17,6 +18,43 @@ pub enum Content {
     Image(u8),
     /// A program with this number, for its place.
     Program(u8, Extent),
+    /// Bytes of this seed. Some begin as valid data do.
+    Noise(u64),
+}
+
+/// What of it is one transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// This block of a block file, counted from 0, modulo their number.
+    Block(usize),
+    /// All of it, raw or sealed.
+    Whole,
+    /// All of it as Intel HEX. (A sealed device has no other form than sealed.)
+    Hex,
+}
+
+/// What is wrong with a transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Flaw {
+    None,
+    /// A flipped bit in this byte, modulo the length.
+    Bit(usize),
+    /// A wrong CRC of a block, or checksum of a record.
+    Crc,
+    /// This address, of the data or of the program's start.
+    Address(u32),
+    /// The identity of another product.
+    Product,
+    /// Its end is missing: so many thousandths.
+    Short(usize),
+}
+
+/// A transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sent {
+    pub content: Content,
+    pub part: Part,
+    pub flaw: Flaw,
 }
 
 /// The size of a program.
@@ -28,6 +66,8 @@ pub enum Extent {
     Large,
     /// The same, and its control block does not tell it.
     Untold,
+    /// So many bytes, and no fewer than 8.
+    Bytes(usize),
 }
 
 /// The bootloader of a new device.
@@ -42,6 +82,8 @@ pub struct File {
     pub blocks: Vec<Vec<u8>>,
     /// Raw or sealed, for one transfer.
     pub whole: Vec<u8>,
+    /// Where the first byte is.
+    base: u32,
     /// The CRC by which a device knows it.
     pub crc: u32,
 }
@@ -53,6 +95,66 @@ pub fn file(setup: &'static Setup, content: Content) -> Rc<File> {
     }
     let make = || Rc::new(make(setup, content));
     FILES.with(|files| files.borrow_mut().entry((setup.name, content)).or_insert_with(make).clone())
+}
+
+impl Sent {
+    /// The bytes of the transfer.
+    #[must_use]
+    pub fn bytes(self, setup: &'static Setup) -> Vec<u8> {
+        let file = file(setup, self.content);
+        let (mut bytes, is_block) = match (self.part, self.flaw) {
+            (Part::Block(block), _) => (file.blocks[block % file.blocks.len()].clone(), !setup.takes_sealed),
+            (Part::Hex, Flaw::Address(base)) if !setup.takes_sealed => return hex(base, &file.plain),
+            (Part::Hex, _) if !setup.takes_sealed => (hex(file.base, &file.plain), false),
+            _ => (file.whole.clone(), false),
+        };
+        let len = bytes.len();
+        let product = || bytes.windows(4).position(|word| word == PRODUCT_CODE.to_le_bytes());
+        let other_word = match self.flaw {
+            // The header of a block has its address, and a program begins with its vector table.
+            Flaw::Address(address) => Some((4, address)),
+            // Of the control block, or of the label.
+            Flaw::Product => product().map(|at| (at, !PRODUCT_CODE)),
+            _ => None,
+        };
+        if let Some((at, word)) = other_word {
+            bytes[at..at + 4].copy_from_slice(&word.to_le_bytes());
+            if is_block {
+                let crc = crc32(&bytes[..len - 4]).to_le_bytes();
+                bytes[len - 4..].copy_from_slice(&crc);
+            }
+        }
+        match self.flaw {
+            Flaw::Bit(n) => bytes[n % len] ^= 1 << (n / len % 8),
+            Flaw::Crc => bytes[len - 1] ^= 1,
+            Flaw::Short(thousandths) => bytes.truncate(len * (1000 - thousandths) / 1000),
+            _ => {}
+        }
+        bytes
+    }
+
+    /// The CRC of the program that the transfer makes or completes, if it is accepted.
+    pub(crate) fn crc(self, setup: &'static Setup, sub: u8) -> u32 {
+        // Any beginning of a program is one, too, and data may be any bytes.
+        let is_raw = (self.part == Part::Whole || setup.is_data(sub)) && !setup.takes_sealed;
+        if is_raw {
+            crc32(&self.bytes(setup))
+        } else {
+            file(setup, self.content).crc
+        }
+    }
+
+    /// Whether it is no block of several: its first bytes may be accepted, and the rest not.
+    pub(crate) fn is_stream(self, setup: &Setup, sub: u8) -> bool {
+        !matches!(self.part, Part::Block(_)) || setup.takes_sealed || setup.is_data(sub)
+    }
+
+    /// Whether it has data that this program may have.
+    pub(crate) fn fits(self, setup: &'static Setup, sub: u8) -> bool {
+        let is_its = matches!(self.content, Content::Program(number, _) if number == sub);
+        let is_sound = || self.bytes(setup) == Self { flaw: Flaw::None, ..self }.bytes(setup);
+        setup.is_data(sub) || is_its && (self.is_stream(setup, sub) || is_sound())
+    }
 }
 
 /// Whether an image with this CRC may run on a device.
@@ -83,9 +185,24 @@ fn make(setup: &Setup, content: Content) -> File {
         Content::Program(number, extent) => {
             let region = setup.region(number);
             let end = if region.end() > STAGING.base { STAGING.base + 0x180 } else { region.end() - 0x80 };
-            let size = if extent == Extent::Small { 0x500 } else { (end - region.base) as usize };
-            let image = program(region, PRODUCT_CODE, size, number | (extent as u8) << 4);
-            (number, region.base, 1000, 5, image)
+            let (size, fill) = match extent {
+                Extent::Small => (0x500, 0),
+                Extent::Bytes(size) => (size, size as u8),
+                Extent::Large => ((end - region.base) as usize, 0x10),
+                Extent::Untold => ((end - region.base) as usize, 0x20),
+            };
+            // Nearly all of the flash in few blocks.
+            let chunk = if size > 0x800 { 1000 } else { 200 };
+            (number, region.base, chunk, 5, program(region, PRODUCT_CODE, size, number | fill))
+        }
+        Content::Noise(seed) => {
+            let mut random = Random(seed);
+            let starts: [&[u8]; 5] = [b":020", &[0; 4], &[1, 0, 0, 0], &[0xC0, 0xFF, 0x01, 0x20], &[0xFF; 4]];
+            let mut bytes = random.pick(&starts).to_vec();
+            bytes.extend((0..8 + random.below(300)).map(|_| random.below(256) as u8));
+            // Of no form: it has neither heads nor a seal.
+            let crc = crc32(&bytes);
+            return File { plain: bytes.clone(), blocks: vec![bytes.clone()], whole: bytes, base: 0, crc };
         }
     };
     let crc = if number == BOOTLOADER { crc_of(&plain) } else { crc32(&plain) };
@@ -93,14 +210,15 @@ fn make(setup: &Setup, content: Content) -> File {
         let (vendor_id, product_code, program) = (VENDOR_ID, PRODUCT_CODE, number);
         let sealer = Sealer { vendor_id, product_code, program, version: 1, counter, ..Sealer::default() };
         let whole = sealer.seal(&plain, &root()).expect("it can be sealed");
-        return File { plain, blocks: vec![whole.clone()], whole, crc };
+        return File { plain, blocks: vec![whole.clone()], whole, base, crc };
     }
     let size = plain.len() as u32;
-    let told = if matches!(content, Content::Program(_, Extent::Small | Extent::Large)) { size } else { 0 };
+    let is_told = !matches!(content, Content::Image(_) | Content::Program(_, Extent::Untold));
+    let told = if is_told { size } else { 0 };
     let mut blocks = vec![block(0, 0, &words(&[told, VENDOR_ID, PRODUCT_CODE]))];
     for (n, data) in (0..).zip(plain.chunks(chunk)) {
         blocks.push(block(1 + n, base + n * chunk as u32, data));
     }
     blocks.push(block(u32::MAX, 0, &words(&[size, crc32(&plain)])));
-    File { whole: plain.clone(), plain, blocks, crc }
+    File { whole: plain.clone(), plain, blocks, base, crc }
 }

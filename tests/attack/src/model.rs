@@ -1,18 +1,21 @@
 //! The bootloader on the strict model of a flash, with the resident part's decision after each reset.
 
+use std::task::Poll;
+
 use boot_core::canopen::program::Supply;
 use boot_core::flash::Flash;
 use boot_core::renewal::check;
-use boot_core::store::{Journal, ProgramRecord, RenewalRecord};
-use canopen::{BitRate, Instant, NodeId};
+use boot_core::store::{Journal, NodeParameters, ProgramRecord, RenewalRecord};
+use canopen::od::Address;
+use canopen::{AbortCode, BitRate, Instant, NodeId};
 use kit::model::{caught, ModelFlash, PowerCut, CHIP};
 use kit::renewal::{load, loads, HOME, PLACES, STAGING};
-use kit::rig::{crc32, Rig, Setup};
+use kit::rig::{crc32, go_on, Rig, Setup, BOARD_NODE};
 use shared_abi::geometry::Region;
 use shared_abi::renewal::{Origin, Progress, State};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use crate::device::{Action, Device, Seen, Stored, Trouble};
+use crate::device::{Action, Device, Program, Seen, Stored, Trouble};
 use crate::files::{file, keys, OLD};
 
 /// More steps than any work takes.
@@ -24,27 +27,38 @@ pub struct Model {
     /// The time since the last reset, in ms.
     now: u32,
     starts: u32,
-    /// The sub-index of the last transfer.
-    sub: u8,
+    /// The open transfer: its sub-index, and the bytes that are to come.
+    open: Option<(u8, Vec<u8>)>,
+    request: Option<BootRequest>,
+    read_back: Option<u32>,
+    is_idle: bool,
+}
+
+/// Whether the bootloader of a product can be renewed.
+fn renews(setup: &Setup) -> bool {
+    setup.profile.extras.bootloader.is_some()
 }
 
 impl Model {
-    /// A new device with a bootloader, and no program.
+    /// A new device with a bootloader, and no program; with a buffer of this size for blocks.
     #[must_use]
-    pub fn new(setup: &'static Setup) -> Self {
+    pub fn new(setup: &'static Setup, buffer: usize) -> Self {
         let mut flash = ModelFlash::new(&CHIP);
-        flash.poke(HOME.base, &file(setup, OLD).plain);
+        if renews(setup) {
+            flash.poke(HOME.base, &file(setup, OLD).plain);
+        }
         if setup.takes_sealed {
             flash.poke(setup.layout.key_block().base, &keys());
         }
-        Self { rig: Rig::on(setup, 2048, flash), now: 0, starts: 0, sub: 1 }
+        let rig = Rig::on(setup, buffer, flash);
+        Self { rig, now: 0, starts: 0, open: None, request: None, read_back: None, is_idle: false }
     }
 
     fn reset(&mut self, request: Option<BootRequest>) {
         let is_low = self.rig.chip.supply() == Supply::Low;
         self.rig.reset_for(request);
         self.rig.chip.model().low_from = is_low.then_some(0);
-        (self.now, self.starts) = (0, self.starts + 1);
+        (self.now, self.starts, self.open, self.is_idle) = (0, self.starts + 1, None, false);
     }
 
     fn power_off(&mut self) {
@@ -61,11 +75,28 @@ impl Model {
             if !self.rig.node.is_finishing() {
                 return;
             }
-            if self.rig.node.is_idle_after_step() {
+            if self.step() {
                 self.pass(100);
             }
         }
         panic!("a reset waits for ever");
+    }
+
+    fn step(&mut self) -> bool {
+        self.is_idle = self.rig.node.is_idle_after_step();
+        self.is_idle
+    }
+
+    /// The next part of the open transfer, which ends with its last one.
+    fn go_on(&mut self, bytes: Option<usize>) -> Result<(), AbortCode> {
+        let Some((sub, mut rest)) = self.open.take() else { return Ok(()) };
+        let part: Vec<u8> = rest.drain(..bytes.unwrap_or(rest.len()).min(rest.len())).collect();
+        go_on(&mut *self.rig.node, sub, &part, 7)?;
+        if bytes.is_none() {
+            return self.rig.end(sub);
+        }
+        self.open = Some((sub, rest));
+        Ok(())
     }
 
     fn pass(&mut self, ms: u32) {
@@ -73,26 +104,57 @@ impl Model {
         self.rig.node.set_time(Instant::from_millis(self.now));
     }
 
-    fn perform(&mut self, action: &Action) -> bool {
+    fn perform(&mut self, action: &Action) -> Result<(), AbortCode> {
         let rig = &mut self.rig;
-        let mut taken = Ok(());
+        let data = |sub| Address::new(0x1F50, sub);
+        let mut answer = Ok(());
         match *action {
-            Action::Command { sub, value } => taken = rig.command(sub, value),
-            Action::Password { sub } => taken = rig.unlock(sub),
-            Action::Send { sub, content, block, bytes } => {
-                let file = file(rig.setup, content);
-                let all = block.map_or(&file.whole, |block| &file.blocks[block % file.blocks.len()]);
-                let part = &all[..bytes.unwrap_or(all.len()).min(all.len())];
-                self.sub = sub;
-                taken = rig.begin(sub, Some(all.len() as u32), part);
-                if taken.is_ok() && bytes.is_none() {
-                    taken = rig.end(sub);
+            Action::Command { sub, value } => answer = rig.command(sub, value),
+            Action::Password { sub, is_right } => {
+                if let Some((at, password)) = rig.setup.password(sub) {
+                    let mut password = password.to_vec();
+                    password[0] ^= u8::from(!is_right);
+                    answer = rig.node.write(at, &password);
                 }
             }
-            Action::Cancel => rig.cancel(self.sub),
-            Action::Store(id) => drop(rig.node.store(NodeId::new(id), Some(BitRate::K250))),
-            Action::Run(steps) => rig.steps(steps),
-            Action::Settle => rig.settle(),
+            Action::Send { sub, sent, is_announced, bytes } => {
+                let all = sent.bytes(rig.setup);
+                answer = rig.begin(sub, is_announced.then_some(all.len() as u32), &[]);
+                if answer.is_ok() {
+                    self.open = Some((sub, all));
+                    answer = self.go_on(bytes);
+                }
+            }
+            Action::GoOn(bytes) => answer = self.go_on(bytes),
+            Action::Cancel => {
+                if let Some((sub, _)) = self.open.take() {
+                    rig.cancel(sub);
+                }
+            }
+            Action::Read { index, sub } => {
+                let at = Address::new(index, sub);
+                if rig.node.entries().iter().any(|entry| entry.at == at) && index != 0x1F50 {
+                    answer = rig.node.read(at, &mut [0; 64]).map(drop);
+                }
+            }
+            Action::Upload { sub } if rig.setup.has(sub) && rig.setup.profile.extras.read_back => {
+                let upload = rig.node.upload_start(data(sub)).and_then(|size| {
+                    let mut bytes = vec![0; size.expect("it is known") as usize];
+                    rig.node.upload_data(data(sub), 0, &mut bytes).map(|read| crc32(&bytes[..read]))
+                });
+                answer = upload.map(|crc| self.read_back = Some(crc));
+            }
+            Action::Upload { .. } => {}
+            Action::Store(id) => {
+                let store = rig.node.store(NodeId::new(id), Some(BitRate::K250));
+                answer = if let Poll::Ready(Err(_)) = store { Err(AbortCode::GENERAL) } else { Ok(()) };
+            }
+            Action::Run(steps) => {
+                for _ in 0..steps {
+                    self.step();
+                }
+            }
+            Action::Settle => assert!((0..ENDLESS).any(|_| self.step()), "the work does not end"),
             Action::Wait(ms) => self.pass(ms),
             Action::ResetNode => {
                 self.finish();
@@ -107,6 +169,9 @@ impl Model {
                     Trouble::Dip => flash.low_from = Some(at),
                     Trouble::Fail(fault) => flash.fail = Some((at, fault)),
                     Trouble::Weak(seed) => flash.weak = Some((at, seed)),
+                    Trouble::None => {
+                        (flash.cut, flash.fail, flash.weak, flash.low_from) = (None, None, None, None);
+                    }
                 }
             }
             Action::Supply => rig.chip.model().low_from = None,
@@ -119,8 +184,9 @@ impl Model {
                 self.finish();
             }
             self.reset(Some(request));
+            self.request = Some(request);
         }
-        taken.is_ok()
+        answer
     }
 
     /// One place rots where another image is certain.
@@ -148,46 +214,61 @@ impl Device for Model {
         self.rig.setup
     }
 
-    fn act(&mut self, action: &Action) -> bool {
+    fn act(&mut self, action: &Action) -> Result<(), AbortCode> {
+        (self.is_idle, self.request, self.read_back) = (false, None, None);
         let answer = caught(|| self.perform(action));
         answer.unwrap_or_else(|cause| {
             if !cause.is::<PowerCut>() {
                 std::panic::resume_unwind(cause);
             }
             self.power_off();
-            false
+            Err(AbortCode::GENERAL)
         })
     }
 
     fn look(&mut self) -> Seen {
         let setup = self.rig.setup;
-        let progress = Progress::from_bytes(self.rig.word(0x2007, 9).to_le_bytes());
-        self.rig.chip.model().touched.clear();
+        let origin = renews(setup).then(|| Progress::from_bytes(self.rig.word(0x2007, 9).to_le_bytes()));
+        let origin = origin.map_or(Origin::Home, |progress| progress.expect("known numbers").origin);
+        let touched = std::mem::take(&mut self.rig.chip.model().touched);
         let mut flash = self.rig.chip.model().clone();
         flash.power_on();
         let (layout, host) = (setup.layout, setup.host());
         let journal = Journal::open(&flash, layout.parameters);
         let record = RenewalRecord::load(&journal, &flash);
         let programs = (1..=setup.programs()).map(|number| {
-            let Some(record) = ProgramRecord::load(&journal, &flash, number) else { return Stored::None };
+            let record = ProgramRecord::load(&journal, &flash, number);
             let region = setup.region(number);
-            let place = Region::new(region.base, record.size.min(region.size));
-            let is_true = crc32(flash.cells(place)) == record.crc && flash.is_stable(place);
-            if is_true {
-                Stored::Good(record.crc)
-            } else {
-                Stored::Damaged
-            }
+            let stored = record.map_or(Stored::None, |record| {
+                let place = Region::new(region.base, record.size.min(region.size));
+                let is_true = crc32(flash.cells(place)) == record.crc && flash.is_stable(place);
+                if is_true {
+                    Stored::Good(record.crc)
+                } else {
+                    Stored::Damaged
+                }
+            });
+            let rig = &mut self.rig;
+            let (state, crc, status) = (rig.state(number), rig.identification(number), rig.status(number));
+            let is_true = stored == Stored::Good(crc) || rig.is_true(number);
+            Program { stored, record, state, crc, status, is_true }
         });
+        let programs = programs.collect();
         let staged = check(&flash, PLACES.staging, layout, host);
         Seen {
             starts: self.starts,
-            origin: progress.expect("known numbers").origin,
+            origin,
             loads: loads(&flash, layout, host, None).map(|(header, ..)| header.crc),
             home: load(&flash, PLACES.home, host).ok().map(|header| header.crc),
             record,
             is_staged: record.is_some_and(|record| staged.is_ok_and(|image| image.crc == record.crc)),
-            programs: programs.collect(),
+            programs,
+            node: NodeParameters::load(&journal, &flash, BOARD_NODE, |_| true),
+            is_stored: self.rig.node.stored() == Poll::Ready(Ok(())),
+            touched,
+            request: self.request,
+            read_back: self.read_back,
+            is_idle: self.is_idle,
             is_certain: layout.parameters.iter().all(|region| flash.is_stable(*region)),
         }
     }

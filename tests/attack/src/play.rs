@@ -3,11 +3,12 @@
 use std::collections::BTreeSet;
 use std::fmt;
 
+use canopen::AbortCode;
 use kit::model::caught;
 use shared_abi::renewal::Origin;
 
-use crate::device::{Action, Device};
-use crate::files::{file, NEWEST};
+use crate::device::{Action, Device, Stored, Trouble};
+use crate::files::{file, Content, Extent, Part, NEWEST};
 use crate::rules::{History, RULES};
 use crate::script;
 
@@ -29,48 +30,84 @@ struct Attack<'a, D> {
 }
 
 impl<D: Device> Attack<'_, D> {
-    /// Carries out an action, and checks all rules.
-    fn act(&mut self, action: &Action) -> Result<(), Broken> {
+    /// Carries out an action, and checks all rules; the device's answer.
+    fn act(&mut self, action: &Action) -> Result<Result<(), AbortCode>, Broken> {
         if let Action::Renew(image) = action {
-            return self.act_all(&script::renewal(&self.history.seen, self.device.setup(), *image));
+            let actions = script::renewal(&self.history.seen, self.device.setup(), *image);
+            return self.act_all(&actions).map(Ok);
         }
-        let (is_acknowledged, seen) =
-            caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
-                let text = cause.downcast_ref::<String>().map(String::as_str);
-                let text = text.or(cause.downcast_ref::<&str>().copied());
-                Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
-            })?;
-        self.history.permit(action, is_acknowledged);
+        let (answer, seen) = caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
+            let text = cause.downcast_ref::<String>().map(String::as_str);
+            let text = text.or(cause.downcast_ref::<&str>().copied());
+            Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
+        })?;
+        self.history.note(action, answer);
         if let Some(rule) = RULES.iter().find(|rule| !(rule.is_kept)(&self.history, &seen)) {
             return Err(Broken(rule.name, format!("before: {:X?}\n  now: {seen:X?}", self.history.seen)));
         }
         self.met.lives += u64::from(seen.starts - self.history.seen.starts);
         self.met.states.insert((seen.state() as u8, seen.origin as u8));
         self.history.update(seen);
-        Ok(())
+        Ok(answer)
     }
 
     fn act_all(&mut self, actions: &[Action]) -> Result<(), Broken> {
-        actions.iter().try_for_each(|action| self.act(action))
+        actions.iter().try_for_each(|action| self.act(action).map(drop))
     }
 
-    /// Whatever was done: a tool that knows what it wants gets the newest image installed.
+    /// Whatever was done: a tool that knows what it wants gets the newest image installed, and any program.
     fn repair(&mut self) -> Result<(), Broken> {
         let setup = self.device.setup();
-        self.act_all(&script::make_room(setup))?;
-        for _ in 0..8 {
-            let sub = script::bootloader(setup);
-            self.act_all(&[Action::Settle, Action::Password { sub }, Action::Renew(NEWEST)])?;
+        self.act_all(&[Action::Flash(0, Trouble::None), Action::Cancel])?;
+        if let Some(sub) = setup.profile.extras.bootloader {
+            self.act_all(&script::make_room(setup))?;
+            for _ in 0..8 {
+                let unlock = Action::Password { sub, is_right: true };
+                self.act_all(&[Action::Settle, unlock, Action::Renew(NEWEST)])?;
+            }
+            let seen = &self.history.seen;
+            if seen.home != Some(file(setup, NEWEST).crc) || seen.origin != Origin::Home {
+                let rule = "a tool gets a new bootloader installed afterwards";
+                return Err(Broken(rule, format!("{seen:X?}")));
+            }
         }
-        let seen = &self.history.seen;
-        if seen.home == Some(file(setup, NEWEST).crc) && seen.origin == Origin::Home {
-            return Ok(());
+        for sub in 1..=setup.programs() {
+            // Data have one form.
+            let forms = [Part::Whole, Part::Hex, Part::Block(0)];
+            for part in forms.into_iter().take(if setup.is_data(sub) { 1 } else { 3 }) {
+                self.install(sub, part)?;
+            }
         }
-        Err(Broken("a tool gets a new bootloader installed afterwards", format!("{seen:X?}")))
+        Ok(())
+    }
+
+    /// A host without knowledge of the history installs a program in this form, and starts it.
+    fn install(&mut self, sub: u8, part: Part) -> Result<(), Broken> {
+        let setup = self.device.setup();
+        let content = Content::Program(sub, Extent::Small);
+        let broken = |what: String| Broken("each program can be installed and started afterwards", what);
+        // A host with wrong passwords must wait.
+        self.act_all(&[Action::Settle, Action::Wait(60_000)])?;
+        for action in script::installation(setup, sub, part) {
+            let answer = self.act(&action)?;
+            self.act_all(&[Action::Settle])?;
+            let program = self.history.seen.program(sub).expect("there is one");
+            if answer.is_err() || program.status != 0 {
+                return Err(broken(format!("{action:?}: {answer:?}, {program:X?}")));
+            }
+        }
+        let program = self.history.seen.program(sub).expect("there is one");
+        let is_whole = program.stored == Stored::Good(file(setup, content).crc) && program.state == 0;
+        let is_released = setup.is_data(sub) || program.record.is_some_and(|record| record.signed);
+        if is_whole && is_released {
+            Ok(())
+        } else {
+            Err(broken(format!("{program:X?}")))
+        }
     }
 }
 
-/// Carries out actions on a new device, and installs the newest bootloader at the end.
+/// Carries out actions on a new device, and installs the newest bootloader and each program at the end.
 ///
 /// # Errors
 /// The number of the action that broke a rule, or of all if the tool failed at the end; with the rule.
@@ -78,7 +115,7 @@ pub fn play<D: Device>(mut device: D, actions: &[Action], met: &mut Met) -> Resu
     let history = History::new(device.setup(), device.look());
     let mut attack = Attack { device, history, met };
     for (n, action) in actions.iter().enumerate() {
-        attack.act(action).map_err(|broken| (n, broken))?;
+        attack.act_all(&[*action]).map_err(|broken| (n, broken))?;
     }
     attack.repair().map_err(|broken| (actions.len(), broken))
 }

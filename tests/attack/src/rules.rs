@@ -1,58 +1,134 @@
 //! The rules that a device keeps.
 
-use kit::bench::CLEAR;
+use std::collections::BTreeSet;
+
+use boot_core::store::NodeParameters;
+use canopen::{AbortCode, BitRate, NodeId};
+use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE, START};
 use kit::rig::Setup;
 use shared_abi::renewal::{Origin, State};
+use shared_abi::warm_start::BootRequest;
 
-use crate::device::{Action, Seen, Stored};
-use crate::files::{may_run, Content};
+use crate::device::{Action, Program, Seen, Stored};
+use crate::files::{may_run, Part};
 
-/// What was before an action.
+/// What was before an action, and the action with its answer.
 pub struct History {
     setup: &'static Setup,
+    action: Action,
+    answer: Result<(), AbortCode>,
     /// The device then.
     pub seen: Seen,
     /// The programs, number 1 first: whether this one may be lost since CLEAR or data were accepted.
     may_go: Vec<bool>,
     /// The image in staging has decayed since it was stored.
     rotten: bool,
+    /// The sub-index of the last transfer.
+    sub: u8,
+    /// The sub-indices that an action has named since there was no work: these alone may change.
+    named: BTreeSet<u8>,
+    /// Those that were to be started since the last reset.
+    asked: BTreeSet<u8>,
+    /// START of it was acknowledged, and nothing else was asked.
+    started: Option<u8>,
+    /// The programs that were sent, by number and CRC.
+    sent: Vec<(u8, u32)>,
+    /// The values that LSS may have stored: after a cut a record may read as it likes.
+    nodes: Vec<NodeParameters>,
+    /// The last of them was acknowledged.
+    stores: bool,
 }
 
 impl History {
     pub(crate) fn new(setup: &'static Setup, seen: Seen) -> Self {
-        Self { setup, may_go: vec![false; seen.programs.len()], seen, rotten: false }
+        Self {
+            setup,
+            action: Action::Settle,
+            answer: Ok(()),
+            may_go: vec![false; seen.programs.len()],
+            rotten: false,
+            sub: 1,
+            named: BTreeSet::new(),
+            asked: BTreeSet::new(),
+            started: None,
+            sent: Vec::new(),
+            nodes: vec![seen.node],
+            stores: false,
+            seen,
+        }
     }
 
-    /// Takes note of what an action permits that the device has acknowledged, or not.
-    pub(crate) fn permit(&mut self, action: &Action, is_acknowledged: bool) {
-        let setup = self.setup;
-        self.rotten |= matches!(action, Action::Rot(..));
-        let (sub, may_go) = match *action {
-            // In a sealed device genuine data alone end a program.
-            Action::Command { sub, value: CLEAR } => (sub, is_acknowledged && !setup.takes_sealed),
-            Action::Password { sub } => {
-                (sub, is_acknowledged && !setup.takes_sealed && setup.password_clears())
+    /// Takes note of an action and of its answer.
+    pub(crate) fn note(&mut self, action: &Action, answer: Result<(), AbortCode>) {
+        (self.action, self.answer) = (*action, answer);
+        let (setup, is_taken) = (self.setup, answer.is_ok());
+        if !matches!(action, Action::Run(_) | Action::Settle | Action::Read { .. } | Action::Wait(_)) {
+            self.started = None;
+        }
+        match *action {
+            Action::Command { sub, value } if is_taken => {
+                if matches!(value, CLEAR | SET_SIGNATURE | CLR_SIGNATURE) {
+                    self.named.insert(sub);
+                }
+                // In a sealed device genuine data alone end a program.
+                self.may_lose(sub, value == CLEAR && !setup.takes_sealed);
+                // In CiA 302-3, 2 means reset, which starts the program for some profiles and after a stream.
+                if matches!(value, START | 2) {
+                    self.asked.insert(sub);
+                }
+                self.started = (value == START && setup.has(sub)).then_some(sub);
             }
-            Action::Send { sub, content, block, .. } => {
-                let fits = matches!(content, Content::Program(number, _) if number == sub);
+            Action::Password { sub, .. } if is_taken && setup.password_clears() => {
+                self.named.insert(sub);
+                self.may_lose(sub, !setup.takes_sealed);
+            }
+            Action::Send { sub, sent, .. } => {
+                self.sub = sub;
+                self.sent.push((sub, sent.crc(setup, sub)));
                 // Of a stream the first part may have been accepted.
-                let is_stream = block.is_none() || setup.takes_sealed;
-                let has_data = block != Some(0) || setup.is_data(sub);
-                (sub, (fits || setup.is_data(sub)) && (is_stream || has_data && is_acknowledged))
+                let is_accepted = sent.is_stream(setup, sub) || sent.part != Part::Block(0) && is_taken;
+                self.may_lose(sub, is_accepted && sent.fits(setup, sub));
             }
-            _ => return,
-        };
-        if let Some(program) = self.may_go.get_mut(usize::from(sub).wrapping_sub(1)) {
-            *program |= may_go;
+            Action::Store(id) if is_taken => {
+                self.stores = true;
+                self.nodes.push(NodeParameters { id: NodeId::new(id), bit_rate: BitRate::K250 });
+            }
+            Action::Rot(..) => self.rotten = true,
+            _ => {}
+        }
+        if matches!(action, Action::Send { .. } | Action::GoOn(_)) {
+            self.named.insert(self.sub);
+            if is_taken && setup.profile.download.starts_by_itself {
+                self.asked.insert(self.sub);
+            }
+        }
+    }
+
+    /// This program may be lost now.
+    fn may_lose(&mut self, sub: u8, is_so: bool) {
+        if let Some(may_go) = self.may_go.get_mut(usize::from(sub).wrapping_sub(1)) {
+            *may_go |= is_so;
         }
     }
 
     pub(crate) fn update(&mut self, seen: Seen) {
         self.rotten &= seen.record.is_some();
+        let is_reset = seen.starts != self.seen.starts;
         for ((may_go, now), before) in self.may_go.iter_mut().zip(&seen.programs).zip(&self.seen.programs) {
             // What was accepted belongs to a session; and a new program begins without.
-            let is_over = seen.starts != self.seen.starts || now != before;
-            *may_go &= !(is_over && matches!(now, Stored::Good(_)));
+            let is_over = is_reset || now.stored != before.stored;
+            *may_go &= !(is_over && matches!(now.stored, Stored::Good(_)));
+        }
+        if is_reset {
+            self.asked.clear();
+            (self.started, self.stores) = (None, false);
+        }
+        if seen.is_idle {
+            self.named.clear();
+            if self.stores && seen.is_stored {
+                self.nodes = vec![seen.node];
+            }
+            self.stores = false;
         }
         self.seen = seen;
     }
@@ -69,10 +145,34 @@ pub const RULES: &[Rule] = &[
     Rule { name: "the installation alone removes a confirmed record", is_kept: keeps_confirmed },
     Rule { name: "data are not changed while a record for them is valid", is_kept: records_are_true },
     Rule { name: "a program is lost by CLEAR or by accepted data alone", is_kept: keeps_programs },
+    Rule { name: "a program has the CRC that is told, and was sent with it", is_kept: tells_the_truth },
+    Rule {
+        name: "the journal and what an action names alone are erased or written",
+        is_kept: touches_the_named,
+    },
+    Rule { name: "records that no action names and what LSS stored stay", is_kept: others_stay },
+    Rule { name: "what starts is what was asked for", is_kept: starts_what_was_asked },
+    Rule { name: "values and aborts are those of the standards", is_kept: has_defined_values },
+    Rule { name: "without work no program is busy", is_kept: ends },
+];
+
+/// Errors in 1F57h (SYS TEC manual L-1112d_10, table 3), and the three of sealed images (docs/protocol.md).
+#[rustfmt::skip]
+const ERRORS: [u32; 18] = [
+    0x00, 0x02, 0x04, 0x06, 0x08, 0x0A, 0x0C, 0x0E, 0x10, 0x7E, 0x80, 0x82, 0x84, 0x86, 0x88, 0x8A, 0x8C, 0x8E,
+];
+/// Aborts (CiA 301 table 22).
+#[rustfmt::skip]
+const ABORTS: [u32; 31] = [
+    0x0503_0000, 0x0504_0000, 0x0504_0001, 0x0504_0002, 0x0504_0003, 0x0504_0004, 0x0504_0005, 0x0601_0000,
+    0x0601_0001, 0x0601_0002, 0x0602_0000, 0x0604_0041, 0x0604_0042, 0x0604_0043, 0x0604_0047, 0x0606_0000,
+    0x0607_0010, 0x0607_0012, 0x0607_0013, 0x0609_0011, 0x0609_0030, 0x0609_0031, 0x0609_0032, 0x0609_0036,
+    0x060A_0023, 0x0800_0000, 0x0800_0020, 0x0800_0021, 0x0800_0022, 0x0800_0023, 0x0800_0024,
 ];
 
 fn loads(before: &History, now: &Seen) -> bool {
-    now.loads.is_some_and(|crc| may_run(before.setup, crc))
+    let renews = before.setup.profile.extras.bootloader.is_some();
+    !renews || now.loads.is_some_and(|crc| may_run(before.setup, crc))
 }
 
 fn keeps_confirmed(before: &History, now: &Seen) -> bool {
@@ -87,7 +187,7 @@ fn keeps_confirmed(before: &History, now: &Seen) -> bool {
 
 fn records_are_true(before: &History, now: &Seen) -> bool {
     let is_true = now.record.is_none() || now.is_staged || before.rotten;
-    !now.is_certain || is_true && !now.programs.contains(&Stored::Damaged)
+    !now.is_certain || is_true && now.programs.iter().all(|program| program.stored != Stored::Damaged)
 }
 
 fn keeps_programs(before: &History, now: &Seen) -> bool {
@@ -95,5 +195,68 @@ fn keeps_programs(before: &History, now: &Seen) -> bool {
     let mut programs = was.programs.iter().zip(&now.programs).zip(&before.may_go);
     let is_certain = was.is_certain && now.is_certain;
     !is_certain
-        || programs.all(|((was, now), may_go)| *may_go || now == was || !matches!(was, Stored::Good(_)))
+        || programs.all(|((was, now), may_go)| {
+            *may_go || now.stored == was.stored || !matches!(was.stored, Stored::Good(_))
+        })
+}
+
+fn tells_the_truth(before: &History, now: &Seen) -> bool {
+    let read_back = match before.action {
+        Action::Upload { sub } => now.read_back.zip(now.program(sub)),
+        _ => None,
+    };
+    let is_sent = |(number, program): (u8, &Program)| {
+        program.record.is_none_or(|record| before.sent.contains(&(number, record.crc)))
+    };
+    now.programs.iter().all(|program| program.is_true)
+        && (1..).zip(&now.programs).all(is_sent)
+        && read_back.is_none_or(|(crc, program)| crc == program.crc)
+}
+
+fn touches_the_named(before: &History, now: &Seen) -> bool {
+    let (setup, layout) = (before.setup, before.setup.layout);
+    let named = before.named.iter().filter(|sub| setup.has(**sub)).map(|sub| setup.region(*sub));
+    // A renewal goes on after a reset, and what takes its place ends it.
+    let own = setup.profile.extras.bootloader;
+    let renews = own.is_some_and(|own| before.named.contains(&own)) || before.seen.state() != State::None;
+    let of_renewal = layout.home.into_iter().chain(layout.staging).filter(|_| renews);
+    let places: Vec<_> = named.chain(of_renewal).chain(layout.parameters).collect();
+    now.touched.iter().all(|at| places.iter().any(|place| place.contains(at.base, at.size)))
+}
+
+fn others_stay(before: &History, now: &Seen) -> bool {
+    let mut programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
+    let last = before.nodes.last().filter(|_| before.stores && now.is_idle && now.is_stored);
+    programs.all(|(number, (was, now))| was.record == now.record || before.named.contains(&number))
+        && before.nodes.contains(&now.node)
+        && last.is_none_or(|last| *last == now.node)
+}
+
+fn starts_what_was_asked(before: &History, now: &Seen) -> bool {
+    use BootRequest::{Fresh, Renewal, Start, Trial};
+    let waits = before.started.filter(|_| now.is_idle).and_then(|started| now.program(started));
+    let Some(request) = now.request else { return waits.is_none_or(|program| program.status != 0) };
+    let (Start(number) | Trial(number) | Fresh(number)) = request else {
+        return matches!(request, Renewal(_)) && before.setup.profile.extras.bootloader.is_some();
+    };
+    let Some(record) = now.program(number).and_then(|program| program.record) else { return false };
+    // After a download in one transfer it is released or on trial.
+    let fits = matches!(request, Fresh(_)) || record.signed == matches!(request, Start(_));
+    fits && before.asked.contains(&number) && !before.setup.is_data(number)
+}
+
+fn has_defined_values(before: &History, now: &Seen) -> bool {
+    let has_password = |sub| before.setup.password(sub).is_some();
+    let is_wrong = matches!(before.action, Action::Password { sub, is_right: false } if has_password(sub));
+    let is_defined = |program: &Program| {
+        let Program { state, status, .. } = *program;
+        let errors = if before.setup.takes_sealed { &ERRORS[..] } else { &ERRORS[..15] };
+        [0, 3].contains(&state) && status & 0xFF00 == 0 && errors.contains(&(status & 0xFE))
+    };
+    before.answer.map_or_else(|abort| ABORTS.contains(&abort.0), |()| !is_wrong)
+        && now.programs.iter().all(is_defined)
+}
+
+fn ends(_: &History, now: &Seen) -> bool {
+    !now.is_idle || now.programs.iter().all(|program| program.status & 1 == 0)
 }

@@ -8,20 +8,17 @@ use kit::rig::{crc32, Setup};
 use shared_abi::renewal::{Origin, State};
 
 use crate::device::{Action, Seen, Trouble};
-use crate::files::{file, Content, Extent};
+use crate::files::{file, Content, Extent, Flaw, Part, Sent};
 
 /// Commands of 1F51h.
 const COMMANDS: [u8; 9] = [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, 0x84];
 const IMAGES: [u8; 6] = [1, 1, 2, 2, 4, 5];
 const EXTENTS: [Extent; 4] = [Extent::Small, Extent::Small, Extent::Large, Extent::Untold];
 
-/// The kinds of actions. The last two, which a renewal needs, are in each attack.
-const KINDS: usize = 18;
+const INDICES: [u16; 9] = [0x1000, 0x1001, 0x1008, 0x100A, 0x1018, 0x1F51, 0x1F56, 0x1F57, 0x1F50];
 
-/// The program number of the bootloader.
-pub(crate) fn bootloader(setup: &Setup) -> u8 {
-    setup.profile.extras.bootloader.unwrap_or(0)
-}
+/// The kinds of actions. The last two, which a renewal needs, are in each attack.
+const KINDS: usize = 19;
 
 struct Script {
     setup: &'static Setup,
@@ -49,11 +46,18 @@ pub fn of(setup: &'static Setup, seed: u64) -> Vec<Action> {
 
 impl Script {
     fn draw(&mut self, kind: usize) {
-        let own = bootloader(self.setup);
         let random = &mut self.random;
         let program = 1 + random.below(self.setup.programs().into()) as u8;
-        let of_program = Content::Program(program, random.pick(&EXTENTS));
-        let image = Content::Image(random.pick(&IMAGES));
+        // Mostly small, and sometimes for another place.
+        let least = random.pick(&[8, 0x200, 0x280]);
+        let bytes = Extent::Bytes(least + 4 * random.below(40));
+        let extent = if random.chance(50) { random.pick(&EXTENTS) } else { bytes };
+        let place = if random.chance(5) { 1 } else { program };
+        let of_program = Content::Program(place, extent);
+        let renews = self.setup.profile.extras.bootloader;
+        let own = renews.unwrap_or(program);
+        // Without a renewal there are programs alone.
+        let image = renews.map_or(of_program, |_| Content::Image(random.pick(&IMAGES)));
         let any = 1 + random.below(4) as u8;
         let sub = random.pick(&[program, program, own, own, any]);
         let far = random.pick(&[25, 80, 300]);
@@ -66,16 +70,17 @@ impl Script {
                 let value = if random.chance(95) { random.pick(&COMMANDS) } else { seed as u8 };
                 self.actions.push(Action::Command { sub, value });
             }
-            2 => self.actions.push(Action::Password { sub }),
-            3 | 4 => self.download(own, image),
+            2 => self.actions.push(Action::Password { sub, is_right: random.chance(80) }),
             5 | 6 => self.download(program, of_program),
             7 => {
                 // Of one of two masters, which may not end it.
-                let content = random.pick(&[of_program, image]);
-                let block = random.chance(60).then(|| random.below(3));
+                let content = random.pick(&[of_program, of_program, image, Content::Noise(seed)]);
+                let block = random.below(3);
+                let part = random.pick(&[Part::Block(block), Part::Whole, Part::Hex]);
                 let bytes = random.chance(60).then(|| random.below(1500));
-                self.actions.push(Action::Send { sub, content, block, bytes });
-                self.actions.extend(seed.is_multiple_of(3).then_some(Action::Cancel));
+                let sent = Sent { content, part, flaw: self.flaw(20) };
+                self.actions.push(Action::Send { sub, sent, is_announced: seed % 2 == 0, bytes });
+                self.actions.extend((seed % 3 == 0).then_some(Action::Cancel));
             }
             8 => self.actions.push(Action::Wait(random.pick(&[1, 1000, 40_000, 60_000]))),
             9 => self.actions.push(Action::Store(1 + (seed % 127) as u8)),
@@ -85,16 +90,19 @@ impl Script {
             13 => self.actions.push(Action::Flash(after, random.pick(&[Trouble::Dip, fails]))),
             14 => self.actions.push(Action::Flash(after, Trouble::Weak(seed))),
             15 => self.reset(Action::Rot(seed as usize, (seed >> 32) as u8)),
-            16 => self.go_on(),
-            _ => {
-                let image = if seed.is_multiple_of(4) { image } else { Content::Image(1) };
-                self.actions.extend(self.is_locked.then_some(Action::Password { sub: own }));
+            16 if seed % 3 == 0 => self.actions.push(Action::Upload { sub: program }),
+            16 => self.actions.push(Action::Read { index: random.pick(&INDICES), sub: any - 1 }),
+            17 => self.go_on(),
+            18 if renews.is_some() => {
+                let image = if seed % 4 == 0 { image } else { Content::Image(1) };
+                self.actions.extend(self.is_locked.then_some(Action::Password { sub: own, is_right: true }));
                 if self.random.chance(40) {
                     let trouble = self.random.pick(&[Trouble::Dip, fails]);
                     self.actions.push(Action::Flash(after, trouble));
                 }
                 self.reset(Action::Renew(image));
             }
+            _ => self.download(own, image),
         }
         self.actions.extend(self.random.chance(20).then_some(Action::Supply));
     }
@@ -112,31 +120,66 @@ impl Script {
         self.is_locked = true;
     }
 
-    fn send(&mut self, sub: u8, content: Content, block: usize) {
-        self.actions.push(Action::Send { sub, content, block: Some(block), bytes: None });
-        self.run();
+    /// A flaw in a transfer, with this probability in percent.
+    fn flaw(&mut self, percent: usize) -> Flaw {
+        let (layout, random) = (self.setup.layout, &mut self.random);
+        let region = random.pick(layout.programs);
+        let ends = [region.base, region.base - 4, region.end() - 8, region.end(), 0xFFFF_FFF0];
+        let addresses = [&ends[..], &[layout.bootloader.base, layout.parameters[0].base]].concat();
+        match random.below(6) {
+            _ if !random.chance(percent) => Flaw::None,
+            0 => Flaw::Bit(random.below(20_000)),
+            1 => Flaw::Crc,
+            2 => Flaw::Address(random.pick(&addresses)),
+            3 => Flaw::Product,
+            _ => Flaw::Short(1 + random.below(999)),
+        }
     }
 
-    /// All blocks of a file, or a few that nobody has announced.
+    fn send(&mut self, sub: u8, content: Content, part: Part, flawed: usize) {
+        let (is_announced, is_whole) = (self.random.chance(50), self.random.chance(90));
+        let bytes = (!is_whole).then(|| self.random.below(600));
+        let sent = Sent { content, part, flaw: self.flaw(flawed) };
+        self.actions.push(Action::Send { sub, sent, is_announced, bytes });
+        self.run();
+        if !is_whole {
+            let more = self.random.below(400);
+            let end = self.random.pick(&[Action::GoOn(None), Action::GoOn(None), Action::Cancel]);
+            self.actions.extend([Action::GoOn(Some(more)), Action::Run(20), end]);
+            self.run();
+        }
+    }
+
+    /// All blocks of a file, or a few that nobody has announced; or one transfer. Then a command.
     fn download(&mut self, sub: u8, content: Content) {
         let asks = std::mem::take(&mut self.is_locked) || self.random.chance(10);
-        self.actions.extend(asks.then_some(Action::Password { sub }));
+        self.actions.extend(asks.then_some(Action::Password { sub, is_right: true }));
         self.actions.extend(self.random.chance(50).then_some(Action::Command { sub, value: CLEAR }));
         let blocks = file(self.setup, content).blocks.len();
         let from = if self.random.chance(80) { 0 } else { self.random.below(blocks) };
-        let ends = self.random.pick(&[1, 30, 50]);
-        for block in from..blocks {
-            self.send(sub, content, block);
+        let mut parts: Vec<_> = (from..blocks).map(Part::Block).collect();
+        if self.setup.has(sub) && self.random.chance(40) {
+            parts = vec![self.random.pick(&[Part::Whole, Part::Hex])];
+        }
+        let (ends, flawed) = self.random.pick(&[(1, 0), (1, 20), (30, 0), (50, 5)]);
+        for part in parts {
+            self.send(sub, content, part, flawed);
             if self.random.chance(ends) {
-                break;
+                return;
             }
+        }
+        if self.random.chance(50) {
+            let value = self.random.pick(&[CONFIRM, START, 2]);
+            self.actions.extend([Action::Settle, Action::Command { sub, value }]);
         }
     }
 
     /// A master goes on with what it has begun, or begins it again, whatever came in between.
     fn go_on(&mut self) {
         let sent = |action: &Action| match *action {
-            Action::Send { sub, content, block: Some(block), bytes: None } => Some((sub, content, block)),
+            Action::Send {
+                sub, sent: Sent { content, part: Part::Block(block), .. }, bytes: None, ..
+            } => Some((sub, content, block)),
             _ => None,
         };
         let mut begun: Vec<_> = self.actions.iter().rev().filter_map(sent).take(40).collect();
@@ -150,7 +193,7 @@ impl Script {
         }
         let from = self.random.pick(&[0, 0, block + 1]);
         for block in from..=from + self.random.pick(&[1, 2, 14]) {
-            self.send(sub, content, block);
+            self.send(sub, content, Part::Block(block), 5);
         }
     }
 }
@@ -159,7 +202,7 @@ impl Script {
 fn whole(setup: &'static Setup, sub: u8, content: Content) -> Vec<Action> {
     let mut actions = vec![Action::Settle, Action::Command { sub, value: CLEAR }];
     for block in 0..file(setup, content).blocks.len() {
-        actions.extend([Action::Settle, Action::Send { sub, content, block: Some(block), bytes: None }]);
+        actions.extend([Action::Settle, Action::send(sub, content, Part::Block(block))]);
     }
     actions.push(Action::Settle);
     actions
@@ -167,7 +210,7 @@ fn whole(setup: &'static Setup, sub: u8, content: Content) -> Vec<Action> {
 
 /// What a tool does next so that this image becomes the bootloader. It has given the password.
 pub(crate) fn renewal(seen: &Seen, setup: &'static Setup, image: Content) -> Vec<Action> {
-    let sub = bootloader(setup);
+    let sub = setup.profile.extras.bootloader.expect("it can be renewed");
     let wanted = Some(file(setup, image).crc);
     let is_ready = seen.is_staged && seen.record.map(|record| record.crc) == wanted;
     let value = match (seen.state(), seen.origin) {
@@ -182,11 +225,29 @@ pub(crate) fn renewal(seen: &Seen, setup: &'static Setup, image: Content) -> Vec
 /// What a tool does so that no program reaches into staging: it erases it, or replaces it by a small one.
 pub(crate) fn make_room(setup: &'static Setup) -> Vec<Action> {
     let sub = setup.programs();
-    let mut actions = vec![Action::PowerOff, Action::Settle, Action::Password { sub }];
+    let mut actions = vec![Action::PowerOff, Action::Settle, Action::Password { sub, is_right: true }];
     if setup.takes_sealed {
         actions.extend(whole(setup, sub, Content::Program(sub, Extent::Small)));
     } else {
         actions.extend([Action::Settle].into_iter().chain([Action::Command { sub, value: CLEAR }; 2]));
     }
+    actions
+}
+
+/// What a tool does so that this program is installed in this form, and starts. Work comes after each.
+pub(crate) fn installation(setup: &'static Setup, sub: u8, part: Part) -> Vec<Action> {
+    let content = Content::Program(sub, Extent::Small);
+    let mut actions = vec![match setup.password(sub) {
+        Some(_) => Action::Password { sub, is_right: true },
+        None => Action::Command { sub, value: CLEAR },
+    }];
+    let is_block = part == Part::Block(0);
+    let blocks = if is_block { file(setup, content).blocks.len() } else { 1 };
+    let parts = (0..blocks).map(|block| if is_block { Part::Block(block) } else { part });
+    actions.extend(parts.map(|part| Action::send(sub, content, part)));
+    let is_done = setup.is_data(sub) || setup.profile.download.starts_by_itself && !is_block;
+    let value = [CONFIRM, START];
+    let commands = if is_done { &value[..0] } else { &value[usize::from(!is_block)..] };
+    actions.extend(commands.iter().map(|value| Action::Command { sub, value: *value }));
     actions
 }

@@ -1,4 +1,4 @@
-//! The random lives of devices that are renewed, of each product:
+//! The random lives of devices of each product, with and without a renewal of the bootloader:
 //!
 //! ```sh
 //! COBOOT_ATTACKS=2000 cargo test -p coboot-attack    # seeds for each product
@@ -6,32 +6,33 @@
 //! ```
 
 use attack::device::{Action, Trouble};
-use attack::files::{file, Content, Extent};
+use attack::files::{file, Content, Extent, Part};
 use attack::model::Model;
 use attack::play::{attack, play, Failure, Met};
 use attack::script;
-use kit::rig::RENEWALS;
+use kit::rig::{
+    Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS, STANDARD_1,
+    STANDARD_2,
+};
 
 fn environment(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|value| value.parse().unwrap_or_else(|_| panic!("{name} is no number")))
 }
 
-/// The seeds of each product.
-const ATTACKS: u64 = 40;
-
-#[test]
-fn no_action_takes_the_bootloader_or_a_program() {
+/// Attacks these products with so many seeds; each with these sizes of its buffer, in turn.
+fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, buffers: &[usize]) -> Met {
     let one = environment("COBOOT_ATTACK_SEED");
-    let seeds = one.map_or(0..environment("COBOOT_ATTACKS").unwrap_or(ATTACKS), |seed| seed..seed + 1);
+    let seeds = one.map_or(0..environment("COBOOT_ATTACKS").unwrap_or(seeds), |seed| seed..seed + 1);
     let mut met = Met::default();
     let mut failures: Vec<(&str, Box<Failure>)> = Vec::new();
-    for setup in &RENEWALS {
+    for setup in setups {
         let before = met.lives;
         for seed in seeds.clone() {
             if one.is_some() {
                 println!("{}: {:#?}", setup.name, script::of(setup, seed));
             }
-            let Err(failure) = attack(|| Model::new(setup), seed, &mut met) else { continue };
+            let new = || Model::new(setup, buffers[seed as usize % buffers.len()]);
+            let Err(failure) = attack(new, seed, &mut met) else { continue };
             // One for each rule.
             if failures.iter().all(|(name, told)| (*name, told.broken.0) != (setup.name, failure.broken.0)) {
                 failures.push((setup.name, failure));
@@ -41,23 +42,36 @@ fn no_action_takes_the_bootloader_or_a_program() {
     }
     let told: Vec<_> = failures.iter().map(|(setup, failure)| format!("{setup}, {failure}")).collect();
     assert!(told.is_empty(), "{} rules:\n{}", told.len(), told.join("\n"));
+    met
+}
+
+#[test]
+fn no_action_takes_the_bootloader_or_a_program() {
+    let met = attacks(&RENEWALS, 40, &[2048]);
     // Each state of the record, and each place that an image can come from.
     for wanted in [(0, 0), (1, 0), (1, 1), (2, 2), (3, 0), (3, 3)] {
-        assert!(one.is_some() || met.states.contains(&wanted), "{wanted:?} was not met: {:?}", met.states);
+        let is_met = met.states.contains(&wanted) || environment("COBOOT_ATTACK_SEED").is_some();
+        assert!(is_met, "{wanted:?} was not met: {:?}", met.states);
     }
+}
+
+#[test]
+fn no_action_breaks_a_rule_of_other_devices() {
+    let of_one = [&STANDARD_1, &PAULUS_1, &ESACADEMY_1, &LIFT_1];
+    let of_two = [&STANDARD_2, &AT_ONCE_2, &PAULUS_2, &ESACADEMY_2, &LIFT_2];
+    attacks(of_one.into_iter().chain(of_two), 100, &[256, 1024]);
 }
 
 /// On a device that takes a download without CLEAR a session outlives what it has relied on when it began: an
 /// installation fails (`Some`: in this operation), or a program takes staging. Then it goes on, or begins again.
 #[test]
 fn what_a_session_relies_on_is_asked_again() {
-    let device = RENEWALS.iter().find(|setup| setup.name == "LIFT_1").expect("there is one");
+    let device = RENEWALS.iter().find(|setup| setup.name == "RENEWS_LIFT_1").expect("there is one");
     let (image, program) = (Content::Image(1), Content::Program(1, Extent::Untold));
-    let unlock = Action::Password { sub: 3 };
+    let unlock = Action::Password { sub: 3, is_right: true };
     let all = file(device, program).blocks.len();
     let blocks = |sub, content, count| {
-        let send =
-            move |block| [Action::Send { sub, content, block: Some(block), bytes: None }, Action::Settle];
+        let send = move |block| [Action::send(sub, content, Part::Block(block)), Action::Settle];
         (0..count).flat_map(send).collect::<Vec<_>>()
     };
     let destroys = [vec![unlock], blocks(3, image, 2), blocks(1, program, all), blocks(3, image, 3)];
@@ -70,7 +84,7 @@ fn what_a_session_relies_on_is_asked_again() {
     });
     for actions in bricks.chain([destroys]) {
         let actions = actions.concat();
-        let played = play(Model::new(device), &actions, &mut Met::default());
+        let played = play(Model::new(device, 2048), &actions, &mut Met::default());
         assert!(played.is_ok(), "{actions:?}: {played:?}");
     }
 }

@@ -147,16 +147,16 @@ pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT);
 
 /// Devices that can be renewed. Data of a lift are a program, too, and the bootloader follows them.
 pub static RENEWALS: [Setup; 10] = [
-    setup!("STANDARD_1", 1, renewal::LAYOUT, renews(Profile::STANDARD, 2)),
-    setup!("STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3)),
-    setup!("AT_ONCE_2", 2, renewal::TWO, renews(AT_ONCE, 3)),
-    setup!("PAULUS_1", 1, renewal::LAYOUT, renews(Profile::PAULUS, 2)),
-    setup!("ESACADEMY_1", 1, renewal::LAYOUT, renews(Profile::ESACADEMY, 2)),
-    setup!("ESACADEMY_2", 2, renewal::TWO, renews(Profile::ESACADEMY, 3)),
-    setup!("LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3)),
-    setup!("LIFT_2", 2, renewal::TWO, renews(Profile::LIFT, 3)),
-    setup!("SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), SEAL),
-    setup!("SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), SEAL),
+    setup!("RENEWS_STANDARD_1", 1, renewal::LAYOUT, renews(Profile::STANDARD, 2)),
+    setup!("RENEWS_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3)),
+    setup!("RENEWS_AT_ONCE_2", 2, renewal::TWO, renews(AT_ONCE, 3)),
+    setup!("RENEWS_PAULUS_1", 1, renewal::LAYOUT, renews(Profile::PAULUS, 2)),
+    setup!("RENEWS_ESACADEMY_1", 1, renewal::LAYOUT, renews(Profile::ESACADEMY, 2)),
+    setup!("RENEWS_ESACADEMY_2", 2, renewal::TWO, renews(Profile::ESACADEMY, 3)),
+    setup!("RENEWS_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3)),
+    setup!("RENEWS_LIFT_2", 2, renewal::TWO, renews(Profile::LIFT, 3)),
+    setup!("RENEWS_SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), SEAL),
+    setup!("RENEWS_SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), SEAL),
 ];
 
 /// Devices with sealed images.

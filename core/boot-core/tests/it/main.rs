@@ -2,7 +2,6 @@
 //! takes sealed images, and for one that does not (`kit::boot`). Sealed images themselves are tested in
 //! `tests/`.
 
-mod attacker;
 mod clear;
 mod decision;
 mod download;
