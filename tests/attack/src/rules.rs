@@ -186,8 +186,8 @@ fn keeps_confirmed(before: &History, now: &Seen) -> bool {
 }
 
 fn records_are_true(before: &History, now: &Seen) -> bool {
-    let is_true = now.record.is_none() || now.is_staged || before.rotten;
-    !now.is_certain || is_true && now.programs.iter().all(|program| program.stored != Stored::Damaged)
+    let is_true = now.record.is_none() || now.is_staged || before.rotten || !now.is_certain;
+    is_true && now.programs.iter().all(|program| program.stored != Stored::Damaged)
 }
 
 fn keeps_programs(before: &History, now: &Seen) -> bool {
@@ -225,9 +225,12 @@ fn touches_the_named(before: &History, now: &Seen) -> bool {
 }
 
 fn others_stay(before: &History, now: &Seen) -> bool {
+    // A record with bits between 0 and 1 reads as it likes, and its data are checked by other rules.
     let mut programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
     let last = before.nodes.last().filter(|_| before.stores && now.is_idle && now.is_stored);
-    programs.all(|(number, (was, now))| was.record == now.record || before.named.contains(&number))
+    let is_certain = before.seen.is_certain && now.is_certain;
+    programs
+        .all(|(number, (was, now))| was.record == now.record || before.named.contains(&number) || !is_certain)
         && before.nodes.contains(&now.node)
         && last.is_none_or(|last| *last == now.node)
 }
@@ -239,10 +242,12 @@ fn starts_what_was_asked(before: &History, now: &Seen) -> bool {
     let (Start(number) | Trial(number) | Fresh(number)) = request else {
         return matches!(request, Renewal(_)) && before.setup.profile.extras.bootloader.is_some();
     };
-    let Some(record) = now.program(number).and_then(|program| program.record) else { return false };
+    let record = now.program(number).and_then(|program| program.record);
     // After a download in one transfer it is released or on trial.
-    let fits = matches!(request, Fresh(_)) || record.signed == matches!(request, Start(_));
-    fits && before.asked.contains(&number) && !before.setup.is_data(number)
+    let fits = |signed| matches!(request, Fresh(_)) || signed == matches!(request, Start(_));
+    (record.is_some_and(|record| fits(record.signed)) || !now.is_certain)
+        && before.asked.contains(&number)
+        && !before.setup.is_data(number)
 }
 
 fn has_defined_values(before: &History, now: &Seen) -> bool {

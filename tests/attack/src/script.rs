@@ -64,7 +64,8 @@ impl Script {
         let after = 1 + random.below(far) as u32;
         let seed = random.next();
         let cut = random.pick(&[Cut::Before, Cut::After, Cut::Torn(seed), Cut::Unstable(seed)]);
-        let fails = Trouble::Fail(FlashFault::Failed);
+        let faults = [FlashFault::Failed, FlashFault::Failed, FlashFault::Protected, FlashFault::Verify];
+        let fails = Trouble::Fail(random.pick(&faults));
         match kind {
             0 | 1 => {
                 let value = if random.chance(95) { random.pick(&COMMANDS) } else { seed as u8 };
