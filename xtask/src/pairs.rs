@@ -14,7 +14,7 @@ usage: cargo xtask pairs [--spread]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
 values of any two choices are together in one of them (a covering array), sealed images included, and
-fails when one does not build, is over the budget of its flash, or leaves fewer than 512 bytes of it free on
+fails when one does not build, is over the budget of its flash, or leaves fewer than 32 bytes of it free on
 the compact map. It prints the choices and the size of each.
 
   --spread        each of them for one board, the next for the next; without, each for every board

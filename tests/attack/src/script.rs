@@ -80,8 +80,8 @@ impl Script {
                 let part = random.pick(&[Part::Block(block), Part::Whole, Part::Hex]);
                 let bytes = random.chance(60).then(|| random.below(1500));
                 let sent = Sent { content, part, flaw: self.flaw(20) };
-                self.actions.push(Action::Send { sub, sent, is_announced: seed % 2 == 0, bytes });
-                self.actions.extend((seed % 3 == 0).then_some(Action::Cancel));
+                self.actions.push(Action::Send { sub, sent, is_announced: seed.is_multiple_of(2), bytes });
+                self.actions.extend(seed.is_multiple_of(3).then_some(Action::Cancel));
             }
             8 => self.actions.push(Action::Wait(random.pick(&[1, 1000, 40_000, 60_000]))),
             9 => self.actions.push(Action::Store(1 + (seed % 127) as u8)),
@@ -91,11 +91,11 @@ impl Script {
             13 => self.actions.push(Action::Flash(after, random.pick(&[Trouble::Dip, fails]))),
             14 => self.actions.push(Action::Flash(after, Trouble::Weak(seed))),
             15 => self.reset(Action::Rot(seed as usize, (seed >> 32) as u8)),
-            16 if seed % 3 == 0 => self.actions.push(Action::Upload { sub: program }),
+            16 if seed.is_multiple_of(3) => self.actions.push(Action::Upload { sub: program }),
             16 => self.actions.push(Action::Read { index: random.pick(&INDICES), sub: any - 1 }),
             17 => self.go_on(),
             18 if renews.is_some() => {
-                let image = if seed % 4 == 0 { image } else { Content::Image(1) };
+                let image = if seed.is_multiple_of(4) { image } else { Content::Image(1) };
                 self.actions.extend(self.is_locked.then_some(Action::Password { sub: own, is_right: true }));
                 if self.random.chance(40) {
                     let trouble = self.random.pick(&[Trouble::Dip, fails]);
