@@ -153,7 +153,9 @@ impl Sent {
     pub(crate) fn fits(self, setup: &'static Setup, sub: u8) -> bool {
         let is_its = matches!(self.content, Content::Program(number, _) if number == sub);
         let is_sound = || self.bytes(setup) == Self { flaw: Flaw::None, ..self }.bytes(setup);
-        setup.is_data(sub) || is_its && (self.is_stream(setup, sub) || is_sound())
+        // Another address is in the first bytes; any other flaw may come after accepted ones.
+        let is_late = self.is_stream(setup, sub) && !matches!(self.flaw, Flaw::Address(_));
+        setup.is_data(sub) || is_its && (is_late || is_sound())
     }
 }
 
