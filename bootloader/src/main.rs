@@ -124,6 +124,7 @@ mod app {
         const BLOCK_DOWNLOAD: bool = PRODUCT.block_download;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
         const LSS: bool = PRODUCT.lss;
+        const LSS_IDENTIFY: bool = PRODUCT.lss_identify;
         const LSS_STORE: bool = PRODUCT.lss_store;
         const DETECTS_BIT_RATE: bool = PRODUCT.auto_bit_rate;
         const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;

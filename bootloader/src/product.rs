@@ -113,6 +113,9 @@ pub struct Product {
     pub lss_start_in_configuration: bool,
     /// Whether the device reports a missing node-ID by "non-configured slave".
     pub lss_announce: bool,
+    /// Whether LSS masters find the device by ranges of its address (identify remote slave, 46h to 4Bh), besides
+    /// fastscan; on boards with the split map alone.
+    pub lss_identify: bool,
     /// Whether LSS may store node-ID and bit rate.
     pub lss_store: bool,
     /// Whether programs can be written by SDO block download. Without it the device answers 05040001h, and
@@ -221,6 +224,7 @@ impl Product {
         lss: true,
         lss_start_in_configuration: false,
         lss_announce: false,
+        lss_identify: LAYOUT.home.is_some(),
         lss_store: true,
         block_download: true,
         segments_per_sub_block: 127,
@@ -304,9 +308,10 @@ impl Product {
                     || self.resume
                     || self.read_back
                     || self.program_date
-                    || self.auto_bit_rate),
-            "product: block_upload, second_server, resume, read_back, program_date and auto_bit_rate need the \
-             split map: the compact one has no room for them"
+                    || self.auto_bit_rate
+                    || self.lss_identify),
+            "product: block_upload, second_server, resume, read_back, program_date, auto_bit_rate and lss_identify \
+             need the split map: the compact one has no room for them"
         );
         assert!(
             self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),

@@ -405,7 +405,8 @@ const MISTAKES: &[Mistake] = &[
 const PRODUCTS: &[(&str, &str)] = &[
     ("autostart: Autostart::List(&[2])", "autostart names a program that the layout has not"),
     ("second_server: true, block_download: false", "second_server needs block_download, by which a group gets its data"),
-    ("auto_bit_rate: true", "read_back, program_date and auto_bit_rate need the split map"),
+    ("auto_bit_rate: true", "program_date, auto_bit_rate and lss_identify need the split map"),
+    ("lss_identify: true", "program_date, auto_bit_rate and lss_identify need the split map"),
     ("lss: true, ..Product::of(Profile::LIFT)", "lss needs the split map in a profile with a password"),
     ("intel_hex: true", "intel_hex needs the split map, or ESAcademy's profile"),
     ("segments_per_sub_block: 128", "segments_per_sub_block must be 1 to 127"),

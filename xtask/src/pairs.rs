@@ -14,7 +14,7 @@ usage: cargo xtask pairs [--spread]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
 values of any two choices are together in one of them (a covering array), sealed images included, and
-fails when one does not build, is over the budget of its flash, or leaves fewer than 32 bytes of it free on
+fails when one does not build, is over the budget of its flash, or leaves fewer than 512 bytes of it free on
 the compact map. It prints the choices and the size of each.
 
   --spread        each of them for one board, the next for the next; without, each for every board
@@ -22,7 +22,7 @@ the compact map. It prints the choices and the size of each.
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
-const FIELDS: [(&str, &[&str]); 49] = [
+const FIELDS: [(&str, &[&str]); 50] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Autostart::InOrder", "Autostart::List(&[])", "Autostart::Function(|| &[1])"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -40,6 +40,7 @@ const FIELDS: [(&str, &[&str]); 49] = [
     ("lss", &["true", "false"]),
     ("lss_start_in_configuration", &["false", "true"]),
     ("lss_announce", &["false", "true"]),
+    ("lss_identify", &["true", "false"]),
     ("lss_store", &["true", "false"]),
     ("block_download", &["true", "false"]),
     ("segments_per_sub_block", &["127", "1"]),

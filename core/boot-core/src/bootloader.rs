@@ -166,6 +166,8 @@ pub trait Choices {
     const BLOCK_UPLOAD: bool = true;
     /// Whether it has layer setting services.
     const LSS: bool = true;
+    /// Whether a master finds it by ranges of its address (identify remote slave), too.
+    const LSS_IDENTIFY: bool = true;
     /// Whether layer setting services may store node-ID and bit rate.
     const LSS_STORE: bool = true;
     /// The node-IDs that the device takes: with another one no program starts.
@@ -255,6 +257,9 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         let mut download =
             Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
         download.take_report(&flash, report);
+        if report.reason == Reason::Compaction as u8 {
+            download.compact(true);
+        }
         let mut bootloader = Self {
             config,
             serial_number,
@@ -309,7 +314,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.report_outcome();
         if step != Step::Idle {
             self.idle_at = self.now + IDLE_MS;
-        } else if self.now.has_reached(self.idle_at) && self.download.compact() {
+        } else if self.download.compact(self.now.has_reached(self.idle_at)) {
             return Step::Again;
         }
         if C::EXTRAS.read_back && step == Step::Idle && self.config.download.read_back {
@@ -398,7 +403,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.is_asked
     }
 
-    /// Whether the store is being compacted, or may have to be before a program starts.
+    /// Whether the store is being compacted.
     #[must_use]
     pub fn is_compacting(&self) -> bool {
         self.download.is_compacting()
@@ -594,6 +599,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
 {
     fn has_lss() -> bool {
         C::LSS
+    }
+
+    fn identifies() -> bool {
+        C::LSS_IDENTIFY
     }
 
     fn supports(&mut self, rate: BitRate) -> bool {

@@ -53,6 +53,14 @@ pub trait LssDevice {
         true
     }
 
+    /// Whether a master finds the device by ranges of its address (identify remote slave), too.
+    fn identifies() -> bool
+    where
+        Self: Sized,
+    {
+        true
+    }
+
     /// Whether the device supports this bit rate; for [`BitRate::Auto`], whether it may detect the
     /// bit rate by listening.
     fn supports(&mut self, rate: BitRate) -> bool;
@@ -283,7 +291,7 @@ impl Lss {
     }
 
     /// The answer to a request: its command specifier and the following number.
-    fn request(&mut self, bytes: &[u8; 8], now: Instant, device: &mut impl LssDevice) -> Option<(u8, u32)> {
+    fn request<D: LssDevice>(&mut self, bytes: &[u8; 8], now: Instant, device: &mut D) -> Option<(u8, u32)> {
         let [command, a, b, c, d, ..] = *bytes;
         let number = u32::from_le_bytes([a, b, c, d]);
         let number = match (command, self.state) {
@@ -294,7 +302,7 @@ impl Lss {
             (SELECT_VENDOR..=SELECT_SERIAL, State::Waiting) => {
                 return self.select(command - SELECT_VENDOR, number).then_some((SELECTED, 0));
             }
-            (IDENTIFY_VENDOR..=IDENTIFY_SERIAL_HIGH, _) => {
+            (IDENTIFY_VENDOR..=IDENTIFY_SERIAL_HIGH, _) if D::identifies() => {
                 return self.identify(command - IDENTIFY_VENDOR, number).then_some((IDENTIFIED, 0));
             }
             (IDENTIFY_NON_CONFIGURED, _) => return self.is_unconfigured().then_some((NON_CONFIGURED, 0)),

@@ -51,6 +51,9 @@ pub use sealed::{Sealed, SealedMemory};
 /// The used places of the store from which on it is compacted when the device is idle. An update stores some 20
 /// values at most.
 const USED: u32 = 64;
+/// The same between two downloads: a master that never leaves the device alone must not make its starts slow, and
+/// a program must find room in it.
+const USED_AT_MOST: u32 = 256;
 
 /// One program in the form of the objects 1F50h–1F57h.
 #[derive(Clone, Copy, Debug)]
@@ -467,11 +470,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         step
     }
 
-    /// Compacts the store, unless there is other work or a download is open.
-    pub(crate) fn compact(&mut self) -> bool {
+    /// Compacts the store from so many used places on, unless there is other work or a download is open. Returns
+    /// whether it begins.
+    pub(crate) fn compact(&mut self, is_idle: bool) -> bool {
+        let used = if is_idle { USED } else { USED_AT_MOST };
         let is_open = |program: &Program| matches!(program.session, Session::Open { .. });
         let waits = self.transfer.is_some() || self.boot_request.is_some() || self.programmer.has_work();
-        !waits && !self.programs.iter().any(is_open) && self.programmer.compact(&mut self.parameters, USED)
+        !waits && !self.programs.iter().any(is_open) && self.programmer.compact(&mut self.parameters, used)
     }
 
     /// Compares the flash with the expected program; returns the program's version.

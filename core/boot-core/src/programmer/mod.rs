@@ -130,22 +130,6 @@ enum Change {
     Compact,
 }
 
-/// The used places of the store from which on it is compacted at once: a master that never leaves the device alone
-/// must not make its starts slow, and a program must find room in it.
-const AT_ONCE: u32 = 256;
-
-/// Whether the store is to be compacted. Each value that is stored makes it due again, so a compaction that
-/// fails is not repeated for ever.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Compaction {
-    /// At once from [`AT_ONCE`] on.
-    Due,
-    /// When the device is idle.
-    Later,
-    /// No more.
-    Done,
-}
-
 /// The flash half. It starts operations and polls them, but never waits for them. `P` is the store of the
 /// device, which says what it can do.
 pub(crate) struct Programmer<'b, P> {
@@ -163,7 +147,8 @@ pub(crate) struct Programmer<'b, P> {
     /// Whether the counter proved by the next of these programs is already stored.
     kept: bool,
     job: Option<Job>,
-    compaction: Compaction,
+    /// Whether a value was stored since the last compaction: one that fails is not repeated for ever.
+    may_compact: bool,
     /// The installation of a RAM image.
     install: Option<Phase>,
     /// `None` if the RAM image cannot be renewed.
@@ -186,7 +171,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             detail: 0,
             kept: false,
             job: None,
-            compaction: Compaction::Due,
+            may_compact: true,
             install: None,
             renewing: None,
             running: None,
@@ -419,20 +404,20 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Whether another value can be stored: only a compaction goes on, or nothing.
     pub(crate) fn may_store(&self) -> bool {
-        !self.has_work() && (!self.is_storing() || matches!(self.job, Some(Job::Store(Change::Compact, _))))
+        !self.has_work() && (!self.is_storing() || self.is_compacting())
     }
 
-    /// Whether the store is being compacted, or may have to be at once.
+    /// Whether the store is being compacted.
     pub(crate) fn is_compacting(&self) -> bool {
-        self.compaction == Compaction::Due || matches!(self.job, Some(Job::Store(Change::Compact, _)))
+        matches!(self.job, Some(Job::Store(Change::Compact, _)))
     }
 
     /// Compacts the store, if at least `used` of its places are used. Returns whether it begins.
     pub(crate) fn compact(&mut self, parameters: &mut P, used: u32) -> bool {
-        if self.job.is_some() || self.compaction == Compaction::Done || !parameters.compact(used) {
+        if self.job.is_some() || !self.may_compact || !parameters.compact(used) {
             return false;
         }
-        self.compaction = Compaction::Done;
+        self.may_compact = false;
         self.job = Some(Job::Store(Change::Compact, 0));
         true
     }
@@ -508,12 +493,6 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 outcome = ended;
             }
             if self.job.is_none() {
-                if self.compaction == Compaction::Due {
-                    self.compaction = Compaction::Later;
-                    if self.compact(parameters, AT_ONCE) {
-                        return (Step::Again, None);
-                    }
-                }
                 return match self.choose(parameters, flash, note) {
                     Ok(None) => (Step::Idle, None),
                     Ok(job) => {
@@ -613,7 +592,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         let job = self.job.take()?;
         if matches!(job, Job::Store(change, _) if change != Change::Compact) {
-            self.compaction = Compaction::Due;
+            self.may_compact = true;
         }
         match (job, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),

@@ -401,6 +401,10 @@ impl<D: LssDevice, M> LssDevice for Debugged<'_, D, M> {
         D::has_lss()
     }
 
+    fn identifies() -> bool {
+        D::identifies()
+    }
+
     fn supports(&mut self, rate: BitRate) -> bool {
         self.device.supports(rate)
     }
