@@ -17,6 +17,7 @@ pub use boot_core::profile::Profile;
 
 use boot_core::bootloader::{Extras, PasswordObject};
 use boot_core::canopen::program::ProgramStart;
+use boot_core::canopen::AbortCode;
 use boot_core::control::{Policy, Renewal};
 use boot_core::decision;
 use boot_core::flash::Flash;
@@ -119,7 +120,8 @@ pub struct Product {
     /// Whether LSS may store node-ID and bit rate.
     pub lss_store: bool,
     /// Whether programs can be written by SDO block download. Without it the device answers 05040001h, and
-    /// a master goes on in segments, which takes two to three times as long (`SDO_BLOCKTRANSFER`).
+    /// a master goes on in segments, which takes two to three times as long (`SDO_BLOCKTRANSFER`). On boards with the
+    /// compact map Paulus' dialect has none.
     pub block_download: bool,
     /// The segments of a sub-block of a block download at most, 1 to 127; at low bit rates the device takes
     /// fewer (`SDO_BLOCKSIZE_DOWNLOAD`).
@@ -159,7 +161,7 @@ pub struct Product {
     /// (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and must
     /// leave the peripherals that it uses as after a reset ([`bsp::inputs`] does).
     pub start_allowed: fn(program: u8) -> bool,
-    /// The CRC of blocks and programs (`BLCOP_USE_CRC16`).
+    /// The CRC of blocks and programs (`BLCOP_USE_CRC16`); CRC-16 on boards with the split map alone.
     pub crc: CrcKind,
     /// Bytes of flash that one step of a CRC covers, 64 to 65536. Other work of the same priority
     /// waits for one step at most (`BLCOP_MAX_CRC_STEP_SIZE`).
@@ -257,13 +259,15 @@ impl Product {
     };
 
     /// A product whose only choice is its dialect. On the compact map a dialect has what its manual has:
-    /// ESAcademy's has Intel HEX; ESAcademy's nodes and lifts have a node-ID of their own, and no LSS.
+    /// ESAcademy's has Intel HEX, Paulus' has no SDO block transfer; ESAcademy's nodes and lifts have a node-ID of
+    /// their own, and no LSS.
     pub const fn of(profile: Profile) -> Self {
         let lss = LAYOUT.home.is_some() || !profile.download.locked;
         Self {
             lss,
             // A silent device waits for LSS.
             crystal_failure: if lss { CrystalFailure::Silent } else { CrystalFailure::RunFromHsi },
+            block_download: LAYOUT.home.is_some() || !is_paulus(&profile),
             intel_hex: LAYOUT.home.is_some() || sends_hex(&profile),
             profile,
             ..Self::DEFAULT
@@ -297,6 +301,14 @@ impl Product {
             }
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
+        assert!(
+            LAYOUT.home.is_some() || matches!(self.crc, CrcKind::Crc32),
+            "product: CrcKind::Crc16 needs the split map: the compact one has no room for it"
+        );
+        assert!(
+            LAYOUT.home.is_some() || !self.block_download || !is_paulus(&self.profile),
+            "product: block_download needs the split map in Paulus' profile; Product::of(profile) has what fits"
+        );
         assert!(
             self.block_download || !self.second_server,
             "product: second_server needs block_download, by which a group gets its data"
@@ -535,6 +547,11 @@ impl Product {
             start_allowed: self.start_allowed,
         }
     }
+}
+
+/// Whether the dialect is that of Paulus, whose manual says "SDO block transfer: no".
+const fn is_paulus(profile: &Profile) -> bool {
+    matches!(profile.unknown_request, AbortCode::GENERAL)
 }
 
 /// Whether the dialect is ESAcademy's, whose tools send Intel HEX.

@@ -48,7 +48,7 @@ fn rows() -> Vec<(&'static str, Product)> {
         { segments_per_sub_block: 1 } { receive_queue: 8 } { block_upload: false }
         { block_download: false, second_server: false, block_upload: false }
         { identity_check: false } { check: |_, _| Verdict::Accept } { erase: Some(|_| Erase::AtOnce) }
-        { crc: CrcKind::Crc16 } { crc_step: 64 * 1024 } { block_buffer: 1024 } { watchdog_ms: None, renewal: false }
+        { crc: if LAYOUT.home.is_some() { CrcKind::Crc16 } else { CrcKind::Crc32 } } { crc_step: 64 * 1024 } { block_buffer: 1024 } { watchdog_ms: None, renewal: false }
         { program_watchdog_ms: Some(1000) } { answer_to_reset_ms: 50 } { max_crash_resets: 1 }
         { security_counter: 5 } { counter_with_confirmation: true } { resume: false } { read_back: false }
         { program_date: false } { intel_hex: false } { renewal_s: 1 } { bootloader_counter: 3 }

@@ -135,7 +135,7 @@ impl Variant {
     /// Whether only the split map has room for it, or for the bootloader that it needs.
     fn needs_split(&self) -> bool {
         const FEATURES: [&str; 6] = ["debugger", "log-defmt", "log-rtt", "log-uart", "sealed", "virtual-can"];
-        self.features.split(',').any(|feature| FEATURES.contains(&feature))
+        self.product == Some("crc-16") || self.features.split(',').any(|feature| FEATURES.contains(&feature))
     }
 
     /// The product of the image.

@@ -51,7 +51,7 @@ const FIELDS: [(&str, &[&str]); 50] = [
     ("programming_allowed", &["|| true", "|| bsp::inputs('C') & 2 != 0"]),
     ("erase", &["None", "Some(|_| Erase::AtOnce)"]),
     ("start_allowed", &["|_| true", "|_| bsp::inputs('C') & 1 != 0"]),
-    ("crc", &["CrcKind::Crc32", "CrcKind::Crc16"]),
+    ("crc", &["CrcKind::Crc32", CRC_16]),
     ("crc_step", &["1024", "64 * 1024"]),
     ("block_buffer", &["80 * 1024", "1024"]),
     ("watchdog_ms", &["Some(1000)", "None"]),
@@ -80,6 +80,8 @@ const FIELDS: [(&str, &[&str]); 50] = [
 const SEALED: &str = "sealed";
 
 const NAMEPLATE: &str = "if LAYOUT.home.is_some() { IdentitySource::Otp } else { IdentitySource::Board }";
+
+const CRC_16: &str = "if LAYOUT.home.is_some() { CrcKind::Crc16 } else { CrcKind::Crc32 }";
 
 /// Seven switches for the node-ID, four for the bit rate.
 const SWITCHES: &str = "NodeSource::Function(|| {
