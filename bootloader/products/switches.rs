@@ -15,7 +15,7 @@ pub const PRODUCT: Product = Product {
     bit_rates: 2..=6,
     boot_up_message: false,
     boot_up_emergency: false,
-    sdo_request_base: 0x680,
+    sdo_request_base: 0x300,
     sdo_response_base: 0x480,
     segments_per_sub_block: 20,
     receive_queue: 8,

@@ -93,8 +93,8 @@ pub struct Product {
     /// What the device does when its crystal fails, and the clock of its CAN controller may be wrong.
     pub crystal_failure: CrystalFailure,
     /// Base of the COB-ID of SDO requests; the node-ID is added (`BLCOP_BASE_REQUEST`). With each of
-    /// `node_ids` it must be a COB-ID that the predefined connection set has for nothing else than SDO or PDOs
-    /// (CiA 301 clause 7.3.3): no node of the bus may then use that PDO.
+    /// `node_ids` it must be no reserved COB-ID (CiA 301 clause 7.3.5), and one that the predefined connection set
+    /// has for nothing else than SDO or PDOs (7.3.3): no node of the bus may then use that PDO.
     pub sdo_request_base: u16,
     /// Base of the COB-ID of SDO answers; the node-ID is added (`BLCOP_BASE_RESPONSE`). The same applies.
     pub sdo_response_base: u16,
@@ -382,12 +382,12 @@ impl Product {
         assert!(
             !is_taken(request, 0x600, &self),
             "product: sdo_request_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
-             580h to 67Fh, 700h to 7FFh): take 600h, or a base from 180h to 500h or of 680h"
+             580h to 67Fh, 6E0h to 7FFh): take 600h, or a base from 180h to 500h, or 680h up to node 95"
         );
         assert!(
             !is_taken(response, 0x580, &self),
             "product: sdo_response_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
-             580h to 67Fh, 700h to 7FFh): take 580h, or a base from 180h to 500h or of 680h"
+             580h to 67Fh, 6E0h to 7FFh): take 580h, or a base from 180h to 500h, or 680h up to node 95"
         );
         self.check_board_node();
         assert!(self.crc_step >= 64, "product: crc_step must be 64 bytes or more");
@@ -560,11 +560,11 @@ const fn sends_hex(profile: &Profile) -> bool {
 }
 
 /// Whether this base and a node-ID of the product make a COB-ID that the predefined connection set has for another
-/// service (CiA 301 clauses 7.3.3 and 7.3.5; CiA 305 for LSS). `own` is the base of SDO there. PDOs do not count:
-/// their COB-IDs can be configured.
+/// service, or that no configurable object may have (CiA 301 clauses 7.3.3 and 7.3.5, table of restricted CAN-IDs;
+/// CiA 305 for LSS). `own` is the base of SDO there. PDOs do not count: their COB-IDs can be configured.
 const fn is_taken(base: u16, own: u16, product: &Product) -> bool {
     const fn is_free(base: u16, node_id: u8) -> bool {
-        matches!(base + node_id as u16, 0x181..=0x57F | 0x680..=0x6FF)
+        matches!(base + node_id as u16, 0x181..=0x57F | 0x680..=0x6DF)
     }
     let mut free = match product.profile.node_id {
         Some(id) => is_free(base, id.get()),

@@ -148,7 +148,7 @@ fn the_resident_part_has_its_facts() {
     assert_eq!(facts(firmware::BOOTLOADER), ([1, 32, 0x7F01, 0x3FF], predefined));
     assert_eq!(facts(firmware::BOOTLOADER_LEAST), ([0, 32, 0x7F01, 0x1FF], predefined));
     assert_eq!(facts(firmware::BOOTLOADER_CRC_16), ([1, 16, 0x7F01, 0x3FF], predefined));
-    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), ([1, 32, 0x6402, 0x27C], [0x680, 0x480]));
+    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), ([1, 32, 0x6402, 0x27C], [0x300, 0x480]));
 }
 
 /// The flash contains the 16 vectors of the core; the RAM image begins with all vectors.

@@ -59,7 +59,7 @@ fn device(blocks: &[(u32, [u8; 32])]) -> Bench {
 
 /// Uses a session by the COB-IDs of the product.
 fn with<T>(bench: &mut Bench, what: impl FnOnce(&mut Session<'_>) -> T) -> T {
-    let mut ids = SdoIds::new(bench, 0x680, 0x480);
+    let mut ids = SdoIds::new(bench, 0x300, 0x480);
     what(&mut Session::new(&mut ids, NodeId::new(NODE).unwrap(), Timing::default()))
 }
 

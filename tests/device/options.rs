@@ -30,7 +30,7 @@ fn switched_on(node: u8, rate: BitRate) -> Bench {
     bench
 }
 
-/// A request for 1000h on 680h plus the node-ID is answered on 480h plus the node-ID, and the
+/// A request for 1000h on 300h plus the node-ID is answered on 480h plus the node-ID, and the
 /// predefined COB-IDs are unused.
 #[test]
 fn node_id_bit_rate_and_cob_ids_are_the_products() {
@@ -39,7 +39,7 @@ fn node_id_bit_rate_and_cob_ids_are_the_products() {
         assert!(bench.records().is_empty(), "no boot-up message, no emergency");
         let id = u32::from(node);
         let request = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
-        let answer = bench.ask(0x680 + u16::from(node), &request, 0x480 + id);
+        let answer = bench.ask(0x300 + u16::from(node), &request, 0x480 + id);
         assert_eq!(answer.unwrap(), [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]);
         assert_eq!(bench.ask(0x600 + u16::from(node), &request, 0x580 + id), None);
         bench.run_ms(1000);
@@ -64,7 +64,7 @@ fn switches_out_of_range_stand_for_the_boards() {
         }
         bench.power_on();
         bench.run_ms(50);
-        let answer = bench.ask(0x6AA, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
+        let answer = bench.ask(0x32A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
         assert!(answer.is_some(), "index {index}: at 125 kbit/s");
     }
     let bench = switched_on(0, BitRate::K500);
@@ -98,7 +98,7 @@ fn lss_starts_in_configuration_and_stores_nothing() {
 fn block_download_has_the_products_sub_blocks_or_is_not_there() {
     let initiate = [0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0];
     let mut bench = switched_on(42, BitRate::K500);
-    let answer = bench.ask(0x6AA, &initiate, 0x4AA).unwrap();
+    let answer = bench.ask(0x32A, &initiate, 0x4AA).unwrap();
     assert_eq!(answer, [0xA4, 0x50, 0x1F, 1, 20, 0, 0, 0]);
 
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST).switched_on();
@@ -117,7 +117,7 @@ fn an_update_keeps_the_cob_ids_of_the_product() {
     let node = canopen::NodeId::new(42).unwrap();
     for program in [firmware::APP_V1, firmware::APP_V2, firmware::APP_C] {
         let file = firmware::blocks(program);
-        let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+        let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
         let mut session = Session::new(&mut ids, node, Timing::default());
         let report = flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
         assert!(!report.running.unwrap().is_bootloader(), "{program}");
@@ -135,11 +135,11 @@ fn a_pin_says_whether_a_program_is_valid() {
     let file = firmware::blocks(firmware::APP_V1);
     let node = canopen::NodeId::new(42).unwrap();
     let in_bootloader = |bench: &mut Bench| {
-        let answer = bench.ask(0x6AA, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
+        let answer = bench.ask(0x32A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
         answer.unwrap() == [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]
     };
     {
-        let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+        let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
         let mut session = Session::new(&mut ids, node, Timing::default());
         let options = FlashOptions::default().start(false);
         flash(&mut session, &file, &options, &mut |_| {}).unwrap();
@@ -161,7 +161,7 @@ fn a_pin_says_whether_a_program_is_valid() {
     bench.machine().set_pin('C', 0, Some(false));
     bench.power_on();
     bench.run_ms(50);
-    let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+    let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
     let mut session = Session::new(&mut ids, node, Timing::default());
     session.command(1, ProgramControl::Clear).unwrap();
     session.await_idle(1, Doing::Block(0)).unwrap();

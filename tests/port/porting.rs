@@ -203,7 +203,7 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
             format!("{include}, autostart: Autostart::List(&[]), rescue_window_ms: 0"),
             "product: `resident` has another autostart",
         ),
-        (format!("{include}, sdo_request_base: 0x680"), "product: `resident` has another sdo_request_base"),
+        (format!("{include}, sdo_request_base: 0x300"), "product: `resident` has another sdo_request_base"),
         (format!("{include}, rom_loader: true"), "product: `resident` has another rom_loader"),
         (format!("{include}, identity: IdentitySource::Otp"), "product: `resident` has another identity"),
     ] {
@@ -425,12 +425,15 @@ const PRODUCTS: &[(&str, &str)] = &[
     ("bit_rates: 3..=9", "bit_rates must be a range within 0 to 8"),
     ("sdo_request_base: 0x781", "sdo_request_base and sdo_response_base must be 80h to 780h"),
     ("sdo_request_base: 0x5FF", "sdo_request_base and sdo_response_base must be 80h or more apart"),
-    ("sdo_request_base: 0x680, sdo_response_base: 0x701", "the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"),
+    ("sdo_request_base: 0x300, sdo_response_base: 0x701", "the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"),
     // CiA 301 table 39 (predefined connection set): EMCY has 081h to 0FFh, SDO of other nodes 581h to 67Fh; CiA
     // 305: LSS has 7E4h and 7E5h. The board has node-ID 1 and 125 kbit/s.
     ("sdo_response_base: 0x80", "sdo_response_base plus one of node_ids is a COB-ID of another service"),
     ("sdo_request_base: 0x780", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
-    ("sdo_request_base: 0x501, sdo_response_base: 0x680", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    ("sdo_request_base: 0x501, sdo_response_base: 0x300", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    // CiA 301 table 40 (restricted CAN-IDs): 6E0h to 6FFh. Up to node 95 base 680h is free.
+    ("sdo_request_base: 0x680, node_ids: 1..=96", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    ("sdo_request_base: 0x680, node_ids: 1..=95, crc_step: 63", "crc_step must be 64 bytes or more"),
     // The bootloader of a lift is node 126.
     ("profile: Profile::LIFT, node_ids: 1..=10, sdo_request_base: 0x510, sdo_response_base: 0x480", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
     ("node_ids: 10..=20", "node_ids is without the node-ID of a new device"),

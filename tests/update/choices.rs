@@ -42,7 +42,7 @@ fn rows() -> Vec<(&'static str, Product)> {
         { rescue_window_confirmed_ms: 100 } { node_ids: 1..=100 } { bit_rates: 2..=6 }
         { node_source: NodeSource::Constant } { boot_up_message: false }
         { crystal_failure: CrystalFailure::RunFromHsi, lss: false }
-        { sdo_request_base: 0x680 } { sdo_response_base: 0x480 } { auto_bit_rate: false }
+        { sdo_request_base: 0x300 } { sdo_response_base: 0x480 } { auto_bit_rate: false }
         { boot_up_emergency: false } { heartbeat_ms: 0 } { lss_start_in_configuration: true }
         { lss_announce: true } { lss_identify: false } { lss_store: false } { block_download: false, second_server: false }
         { segments_per_sub_block: 1 } { receive_queue: 8 } { block_upload: false }

@@ -32,7 +32,7 @@ const FIELDS: [(&str, &[&str]); 50] = [
     ("node_source", &["NodeSource::Stored", "NodeSource::Constant", SWITCHES]),
     ("boot_up_message", &["true", "false"]),
     ("crystal_failure", &["CrystalFailure::Silent", "CrystalFailure::RunFromHsi"]),
-    ("sdo_request_base", &["0x600", "0x680"]),
+    ("sdo_request_base", &["0x600", "0x300"]),
     ("sdo_response_base", &["0x580", "0x480"]),
     ("auto_bit_rate", &["true", "false"]),
     ("boot_up_emergency", &["true", "false"]),
