@@ -385,6 +385,43 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     assert_eq!(cell(&bench), None);
 }
 
+/// While the journal makes room, before the program starts: what belongs to an update keeps the device in the
+/// bootloader, and a master that greets each device after its boot-up does not.
+#[test]
+fn an_update_can_begin_while_the_journal_makes_room() {
+    let mut bench = board_with_a_program();
+    bench.fill_journal(0);
+    // Its two regions follow each other.
+    let [journal, _] = firmware::board().parameters;
+    let mut full = vec![0; 2 * journal.size as usize];
+    bench.machine().read_memory(journal.base, &mut full).unwrap();
+    let init = [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'];
+    let coboot = [[0x21, 0x05, 0x60, 1, 6, 0, 0, 0], *b"\x03coboot\0"];
+    for (image, node, frames, stays) in [
+        (firmware::BOOTLOADER, NODE, &[[0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]][..], true),
+        (firmware::BOOTLOADER, NODE, &[[0x21, 0x50, 0x1F, 1, 0, 1, 0, 0]], true),
+        (firmware::BOOTLOADER_ESACADEMY, 64, &[init], true),
+        (firmware::BOOTLOADER_LIFT, 126, &coboot, true),
+        // The history of errors is deleted; no second SDO server; a value that is constant.
+        (firmware::BOOTLOADER, NODE, &[[0x2F, 0x03, 0x10, 0, 0, 0, 0, 0]], false),
+        (firmware::BOOTLOADER, NODE, &[[0x23, 0x01, 0x12, 1, 0, 0, 0, 0x80]], false),
+        (firmware::BOOTLOADER, NODE, &[[0x2B, 0x17, 0x10, 0, 0xE8, 3, 0, 0]], false),
+    ] {
+        load(&mut bench, &Parts::of(image));
+        bench.machine().load_bin(journal.base, &full).unwrap();
+        bench.power_on();
+        bench.await_boot_up_of(node, 100);
+        bench.events();
+        let mut ask = |data: &[u8]| bench.ask(0x600 + u16::from(node), data, 0x580 + u32::from(node));
+        // 2007h/2: COMPACTION.
+        assert_eq!(ask(&[0x40, 0x07, 0x20, 2, 0, 0, 0, 0]).unwrap(), [0x4F, 0x07, 0x20, 2, 14, 0, 0, 0]);
+        frames.iter().for_each(|frame| drop(ask(frame).expect("an answer")));
+        bench.run_ms(800);
+        assert_eq!(bench.events().is_empty(), stays, "{image}: {frames:X?}");
+        bench.power_off();
+    }
+}
+
 /// An application that crashes is started again, and the flash is not changed: there is no
 /// bootloader to stay in.
 #[test]

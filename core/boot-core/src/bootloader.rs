@@ -232,7 +232,7 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Cho
     signatures: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
-    /// 1F50h or 1F51h was written since the start.
+    /// An object of an update was written since the start.
     is_asked: bool,
     /// From this time on the device is idle, unless there is work on the flash before it.
     idle_at: Instant,
@@ -382,22 +382,13 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.download.busy()
     }
 
-    /// 1F51h: carries out a command as if a client had written it.
-    ///
-    /// # Errors
-    /// The abort for the client.
-    pub fn command(&mut self, sub: u8, command: ProgramControl) -> Result<(), AbortCode> {
-        self.is_asked = true;
-        self.download.command(Self::program(sub), command)
-    }
-
     /// The program (0 for none) has returned the device to the bootloader: from now on it starts
     /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
     }
 
-    /// Whether 1F50h or 1F51h was written since the start: a master is at work.
+    /// Whether an object of an update was written since the start, be it the password: a master is at work.
     #[must_use]
     pub fn is_asked(&self) -> bool {
         self.is_asked
@@ -509,6 +500,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         }
         match (at.index, data) {
             (ACCESS, request) if C::EXTRAS.sealed => {
+                self.is_asked = true;
                 if self.signatures.is_waiting(self.now) {
                     return Err(AbortCode::DEVICE_STATE);
                 }
@@ -522,10 +514,15 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
                 if u32::from_le_bytes([a, b, c, d]) != ROM_LOADER_SIGNATURE {
                     return Err(AbortCode::STORE);
                 }
+                self.is_asked = true;
                 self.download.leave_for_rom_loader(&self.flash)
             }
-            (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
+            (PROGRAM_CONTROL, &[value]) => {
+                self.is_asked = true;
+                self.download.command(Self::program(at.sub), ProgramControl::try_from(value)?)
+            }
             (ENABLE_FLASH | UNLOCK, password) if C::EXTRAS.has_password() => {
+                self.is_asked = true;
                 self.lock.open(password, self.now)?;
                 match at.index {
                     ENABLE_FLASH => self.download.unlock(Self::program(at.sub), true),
