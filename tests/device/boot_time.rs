@@ -114,13 +114,17 @@ fn starts(bench: &mut Bench, set: impl Fn(&mut Bench)) -> [Span; 4] {
 }
 
 /// SysTick holds anything after a reset (ARMv7-M B3.3.5). From FFFFFFh the first period is a tenth of a second.
-/// The watchdog's values take longest with the slowest LSI.
+/// The watchdog's values take longest with the slowest LSI. The application looks at its deadlines by a clock of its
+/// own: a request meets it in any phase.
 #[test]
 fn the_bootloader_does_not_wait_for_what_systick_held() {
     let silicon = Silicon { systick_value: 0x00FF_FFFF, lsi_hz: 17_000, ..TYPICAL };
     let mut bench = running_board(ChipOptions { silicon, ..ChipOptions::default() });
-    for ((start, budget), time) in STARTS.into_iter().zip(starts(&mut bench, |_| {})) {
-        assert!(micros(time) <= budget, "{start}: {} us", micros(time));
+    for phase in 0..4 {
+        for ((start, budget), time) in STARTS.into_iter().zip(starts(&mut bench, |bench| bench.run_ms(phase)))
+        {
+            assert!(micros(time) <= budget, "{start}, {phase} ms later: {} us", micros(time));
+        }
     }
 }
 
