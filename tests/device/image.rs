@@ -236,9 +236,7 @@ fn gdb_loads_it_and_finds_symbols_in_ram() {
 
 /// A board with version 1 of the application, switched off.
 fn board_with_a_program() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.install(firmware::APP_V1);
     bench.confirm_program();
     bench.power_off();
@@ -390,31 +388,29 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
 #[test]
 fn an_update_can_begin_while_the_journal_makes_room() {
     let mut bench = board_with_a_program();
-    bench.fill_journal(0);
-    // Its two regions follow each other.
-    let [journal, _] = firmware::board().parameters;
-    let mut full = vec![0; 2 * journal.size as usize];
-    bench.machine().read_memory(journal.base, &mut full).unwrap();
-    let init = [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'];
     let coboot = [[0x21, 0x05, 0x60, 1, 6, 0, 0, 0], *b"\x03coboot\0"];
+    // Errors in 1003h are deleted, 1201h has no COB-ID, 1017h is constant.
+    let greeting = [
+        [0x2F, 0x03, 0x10, 0, 0, 0, 0, 0],
+        [0x23, 1, 0x12, 1, 0, 0, 0, 0x80],
+        [0x2B, 0x17, 0x10, 0, 1, 0, 0, 0],
+    ];
     for (image, node, frames, stays) in [
-        (firmware::BOOTLOADER, NODE, &[[0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]][..], true),
+        (firmware::BOOTLOADER, NODE, &greeting[..], false),
+        (firmware::BOOTLOADER, NODE, &[[0x2F, 0x51, 0x1F, 1, 0, 0, 0, 0]], true),
         (firmware::BOOTLOADER, NODE, &[[0x21, 0x50, 0x1F, 1, 0, 1, 0, 0]], true),
-        (firmware::BOOTLOADER_ESACADEMY, 64, &[init], true),
         (firmware::BOOTLOADER_LIFT, 126, &coboot, true),
-        // The history of errors is deleted; no second SDO server; a value that is constant.
-        (firmware::BOOTLOADER, NODE, &[[0x2F, 0x03, 0x10, 0, 0, 0, 0, 0]], false),
-        (firmware::BOOTLOADER, NODE, &[[0x23, 0x01, 0x12, 1, 0, 0, 0, 0x80]], false),
-        (firmware::BOOTLOADER, NODE, &[[0x2B, 0x17, 0x10, 0, 0xE8, 3, 0, 0]], false),
+        // It makes the program invalid.
+        (firmware::BOOTLOADER_ESACADEMY, 64, &[*b"\x23\x50\x7F\x01TINI"], true),
     ] {
         load(&mut bench, &Parts::of(image));
-        bench.machine().load_bin(journal.base, &full).unwrap();
+        bench.fill_journal(0);
         bench.power_on();
         bench.await_boot_up_of(node, 100);
         bench.events();
         let mut ask = |data: &[u8]| bench.ask(0x600 + u16::from(node), data, 0x580 + u32::from(node));
         // 2007h/2: COMPACTION.
-        assert_eq!(ask(&[0x40, 0x07, 0x20, 2, 0, 0, 0, 0]).unwrap(), [0x4F, 0x07, 0x20, 2, 14, 0, 0, 0]);
+        assert_eq!(ask(&[0x40, 0x07, 0x20, 2, 0, 0, 0, 0]).unwrap()[4], 14);
         frames.iter().for_each(|frame| drop(ask(frame).expect("an answer")));
         bench.run_ms(800);
         assert_eq!(bench.events().is_empty(), stays, "{image}: {frames:X?}");

@@ -16,11 +16,10 @@ const SCR: u32 = 0xE000_ED10;
 const STANDBY: u8 = 8;
 
 /// A board with a confirmed program that runs.
-fn running_board(image: &str, silicon: Silicon, has_watchdog: bool) -> Bench {
+pub(super) fn running_board(image: &str, silicon: Silicon, has_watchdog: bool) -> Bench {
     let mut bench = Bench::of_image_with(image, Options { silicon, ..Options::default() });
     bench.machine().set_hardware_watchdog(has_watchdog);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = bench.switched_on();
     let blocks = firmware::blocks(firmware::APP_V1);
     // This program does not feed a watchdog: it would not live through the watch of the tool.
     let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));

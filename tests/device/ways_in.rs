@@ -5,8 +5,8 @@ use canopen::program::{ProgramControl, DEVICE_STATE, STATE_CRASH_RESETS, STATE_R
 use canopen::{AbortCode, Address};
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
+use emulator::silicon::TYPICAL;
 use emulator::time::Span;
 use shared_abi::geometry::Line;
 
@@ -15,14 +15,8 @@ const TWO_RESETS: u8 = 13;
 
 /// A board with a confirmed program that runs.
 fn running_board(image: &str) -> Bench {
-    let mut bench = Bench::of_image(image).switched_on();
-    let blocks = firmware::blocks(firmware::APP_V1);
-    // This program does not feed a watchdog: it would not live through the watch of the tool.
-    let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
-    flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
-    bench.confirm_program();
+    let mut bench = crate::standby::running_board(image, TYPICAL, false);
     bench.run_ms(20);
-    bench.events();
     bench
 }
 

@@ -4,6 +4,7 @@
 
 use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1, STANDARD_1, STANDARD_2};
 use coflash_core::file::sealed::Sealer;
+use kit::boot::fill_journal;
 use kit::model::{until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::Region;
 
@@ -197,7 +198,7 @@ fn and_while_the_journal_changes_over() {
         before.run(|host| {
             host.commanded(1, 0x83);
         });
-        before.fill_journal(stores);
+        fill_journal(&mut before.chip.clone(), STANDARD_2.layout, stores);
         before.take_touched();
         let through = before.copy();
         through.run(|host| host.install(1, &new.file));

@@ -9,7 +9,6 @@ use boot_core::canopen::{AbortCode, Instant};
 use boot_core::control::SealedMemory;
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances};
-use boot_core::flash::run;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use coflash_core::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
@@ -296,19 +295,6 @@ impl Device {
 
     fn parameters(&self) -> Journal {
         Journal::open(&self.chip, self.setup.layout.parameters)
-    }
-
-    /// Stores so many values, as the boot stage does when it counts resets, so that the journal fills.
-    ///
-    /// # Panics
-    /// If the flash does not take one.
-    pub fn fill_journal(&self, stores: u32) {
-        let mut flash = self.chip.clone();
-        let mut parameters = self.parameters();
-        for count in (0..stores).rev() {
-            parameters.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
-            run(&mut flash, |flash, outcome| parameters.next(flash, outcome)).expect("it is stored");
-        }
     }
 
     /// The boot stage's check of a program.

@@ -8,7 +8,8 @@ use boot_core::renewal::check;
 use boot_core::store::{Journal, NodeParameters, ProgramRecord, RenewalRecord};
 use canopen::od::Address;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use kit::model::{caught, ModelFlash, PowerCut, CHIP};
+use kit::boot::fill_journal;
+use kit::model::{caught, ModelFlash, PowerCut};
 use kit::renewal::{load, loads, HOME, PLACES, STAGING};
 use kit::rig::{crc32, go_on, Rig, Setup, BOARD_NODE};
 use shared_abi::geometry::Region;
@@ -40,10 +41,12 @@ fn renews(setup: &Setup) -> bool {
 }
 
 impl Model {
-    /// A new device with a bootloader, and no program; with a buffer of this size for blocks.
+    /// A device with a bootloader, and no program; with a buffer of this size for blocks, and so many values in
+    /// its journal.
     #[must_use]
-    pub fn new(setup: &'static Setup, buffer: usize) -> Self {
-        let mut flash = ModelFlash::new(&CHIP);
+    pub fn new(setup: &'static Setup, buffer: usize, stores: u32) -> Self {
+        let mut flash = ModelFlash::new(setup.layout.chip);
+        fill_journal(&mut flash, setup.layout, stores);
         if renews(setup) {
             flash.poke(HOME.base, &file(setup, OLD).plain);
         }

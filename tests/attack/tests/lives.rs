@@ -11,16 +11,16 @@ use attack::model::Model;
 use attack::play::{attack, play, Failure, Met};
 use attack::script;
 use kit::rig::{
-    Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS, STANDARD_1,
-    STANDARD_2,
+    Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LARGE_JOURNAL, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS,
+    STANDARD_1, STANDARD_2,
 };
 
 fn environment(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|value| value.parse().unwrap_or_else(|_| panic!("{name} is no number")))
 }
 
-/// Attacks these products with so many seeds; each with these sizes of its buffer, in turn.
-fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, buffers: &[usize]) -> Met {
+/// Attacks these products with so many seeds; each with this buffer and so many values in its journal, in turn.
+fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, kinds: &[(usize, u32)]) -> Met {
     let one = environment("COBOOT_ATTACK_SEED");
     let seeds = one.map_or(0..environment("COBOOT_ATTACKS").unwrap_or(seeds), |seed| seed..seed + 1);
     let mut met = Met::default();
@@ -31,7 +31,8 @@ fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, buffers
             if one.is_some() {
                 println!("{}: {:#?}", setup.name, script::of(setup, seed));
             }
-            let new = || Model::new(setup, buffers[seed as usize % buffers.len()]);
+            let (buffer, stores) = kinds[seed as usize % kinds.len()];
+            let new = || Model::new(setup, buffer, stores);
             let Err(failure) = attack(new, seed, &mut met) else { continue };
             // One for each rule.
             if failures.iter().all(|(name, told)| (*name, told.broken.0) != (setup.name, failure.broken.0)) {
@@ -47,7 +48,7 @@ fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, buffers
 
 #[test]
 fn no_action_takes_the_bootloader_or_a_program() {
-    let met = attacks(&RENEWALS, 40, &[2048]);
+    let met = attacks(&RENEWALS, 40, &[(2048, 0)]);
     // Each state of the record, and each place that an image can come from.
     for wanted in [(0, 0), (1, 0), (1, 1), (2, 2), (3, 0), (3, 3)] {
         let is_met = met.states.contains(&wanted) || environment("COBOOT_ATTACK_SEED").is_some();
@@ -59,7 +60,9 @@ fn no_action_takes_the_bootloader_or_a_program() {
 fn no_action_breaks_a_rule_of_other_devices() {
     let of_one = [&STANDARD_1, &PAULUS_1, &ESACADEMY_1, &LIFT_1];
     let of_two = [&STANDARD_2, &AT_ONCE_2, &PAULUS_2, &ESACADEMY_2, &LIFT_2];
-    attacks(of_one.into_iter().chain(of_two), 100, &[256, 1024]);
+    attacks(of_one.into_iter().chain(of_two), 100, &[(256, 0), (1024, 0)]);
+    // From 64 of its 585 places on the journal is compacted when the device is idle, and soon from 256 on.
+    attacks([&LARGE_JOURNAL], 40, &[50, 240, 560].map(|stores| (2048, stores)));
 }
 
 /// On a device that takes a download without CLEAR a session outlives what it has relied on when it began: an
@@ -84,7 +87,7 @@ fn what_a_session_relies_on_is_asked_again() {
     });
     for actions in bricks.chain([destroys]) {
         let actions = actions.concat();
-        let played = play(Model::new(device, 2048), &actions, &mut Met::default());
+        let played = play(Model::new(device, 2048, 0), &actions, &mut Met::default());
         assert!(played.is_ok(), "{actions:?}: {played:?}");
     }
 }

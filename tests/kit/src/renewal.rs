@@ -7,13 +7,13 @@ use boot_core::flash::Flash;
 use boot_core::renewal::{header, Places};
 use boot_core::store::{Journal, RenewalRecord};
 use shared_abi::abilities::Abilities;
-use shared_abi::geometry::Region;
+use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
 use shared_abi::renewal::{Origin, TrialEnd};
 use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
-use crate::model::ONE_PROGRAM;
+use crate::model::{CHIP, ONE_PROGRAM};
 
 pub const HOME: Region = Region::new(0x0800_0800, 0x400);
 pub const STAGING: Region = Region::new(0x0800_3C00, 0x800);
@@ -31,6 +31,18 @@ pub static LAYOUT: Layout = Layout {
 pub static TWO: Layout =
     Layout { programs: &[Region::new(0x0800_0C00, 0x1800), Region::new(0x0800_2400, 0x2000)], ..LAYOUT }
         .checked();
+static LARGER: Geometry = Geometry {
+    flash: Region::new(0x0800_0000, 0xC400),
+    sectors: &[CHIP.sectors[0], CHIP.sectors[1], CHIP.sectors[2], SectorRun { count: 2, size: 0x4000 }],
+    ..CHIP
+};
+/// [`TWO`] with a journal in two sectors more, which are as large as on a chip.
+pub static LARGE_JOURNAL: Layout = Layout {
+    chip: &LARGER,
+    parameters: [Region::new(0x0800_4400, 0x4000), Region::new(0x0800_8400, 0x4000)],
+    ..TWO
+}
+.checked();
 pub const PLACES: Places = match Places::of(&LAYOUT) {
     Some(places) => places,
     None => panic!("the layout has staging"),

@@ -26,7 +26,7 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::boot::{leaked, Boot, Store};
 use crate::ihex::{record, END_OF_FILE};
-use crate::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use crate::model::{Chip, ModelFlash, ONE_PROGRAM, TWO_PROGRAMS};
 use crate::renewal::{self, loads};
 
 // --- setups
@@ -158,6 +158,10 @@ pub static RENEWALS: [Setup; 10] = [
     setup!("RENEWS_SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), SEAL),
     setup!("RENEWS_SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), SEAL),
 ];
+
+/// A device that can be renewed with a journal as large as on a chip.
+pub static LARGE_JOURNAL: Setup =
+    setup!("LARGE_JOURNAL", 2, renewal::LARGE_JOURNAL, renews(Profile::STANDARD, 3));
 
 /// Devices with sealed images.
 pub mod sealed {
@@ -292,7 +296,7 @@ pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_
 impl Rig {
     /// A device with empty flash, and a buffer of this size for blocks.
     pub fn new(setup: &'static Setup, buffer: usize) -> Self {
-        Self::on(setup, buffer, ModelFlash::new(&CHIP))
+        Self::on(setup, buffer, ModelFlash::new(setup.layout.chip))
     }
 
     /// A device with this flash.
