@@ -2,11 +2,10 @@
 //! the product `switches`.
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
-use canopen::{Address, BitRate, NodeId};
-use coboot_can::SdoIds;
+use canopen::{Address, BitRate};
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
-use coflash_core::device::{Doing, Session, Timing};
+use coflash_core::device::Doing;
 use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Format};
 use coflash_core::file::Program;
@@ -14,11 +13,10 @@ use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use shared_abi::label::Label;
 
-use crate::options::set_switches;
+use crate::options::{set_switches, with, NODE};
 
 /// RM0090 section 3.8, table 19.
 const OTP: u32 = 0x1FFF_7800;
-const NODE: u8 = 42;
 
 /// The numbers of the OEM's device, and the nameplate with them: the bytes of `tests/abi/layout.rs`, whose check word
 /// comes from an implementation in another language.
@@ -55,12 +53,6 @@ fn device(blocks: &[(u32, [u8; 32])]) -> Bench {
     bench.power_on();
     bench.run_ms(50);
     bench
-}
-
-/// Uses a session by the COB-IDs of the product.
-fn with<T>(bench: &mut Bench, what: impl FnOnce(&mut Session<'_>) -> T) -> T {
-    let mut ids = SdoIds::new(bench, 0x300, 0x480);
-    what(&mut Session::new(&mut ids, NodeId::new(NODE).unwrap(), Timing::default()))
 }
 
 /// 1018h/1 to 4, and whether the bootloader reports them.

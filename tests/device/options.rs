@@ -3,7 +3,7 @@
 //! nothing, an immediate erase, and a pin that shows whether a program is valid.
 
 use canopen::program::ProgramControl;
-use canopen::BitRate;
+use canopen::{BitRate, NodeId};
 use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
@@ -18,6 +18,15 @@ pub(crate) fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
     for pin in 4..15 {
         bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));
     }
+}
+
+/// The node-ID of most tests.
+pub(crate) const NODE: u8 = 42;
+
+/// Uses a session with this node by the COB-IDs of the product.
+pub(crate) fn with<T>(bench: &mut Bench, what: impl FnOnce(&mut Session<'_>) -> T) -> T {
+    let mut ids = SdoIds::new(bench, 0x300, 0x480);
+    what(&mut Session::new(&mut ids, NodeId::new(NODE).unwrap(), Timing::default()))
 }
 
 /// A running device with these switches, on a bus with 500 kbit/s.
@@ -78,7 +87,7 @@ fn switches_out_of_range_stand_for_the_boards() {
 /// Layer setting services start in configuration state, set a node-ID, and store nothing.
 #[test]
 fn lss_starts_in_configuration_and_stores_nothing() {
-    let mut bench = switched_on(42, BitRate::K500);
+    let mut bench = switched_on(NODE, BitRate::K500);
     // 5Eh: inquire node-ID, without a selection.
     let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
     assert_eq!(answer[..2], [0x5E, 42]);
@@ -97,7 +106,7 @@ fn lss_starts_in_configuration_and_stores_nothing() {
 #[test]
 fn block_download_has_the_products_sub_blocks_or_is_not_there() {
     let initiate = [0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0];
-    let mut bench = switched_on(42, BitRate::K500);
+    let mut bench = switched_on(NODE, BitRate::K500);
     let answer = bench.ask(0x32A, &initiate, 0x4AA).unwrap();
     assert_eq!(answer, [0xA4, 0x50, 0x1F, 1, 20, 0, 0, 0]);
 
@@ -112,16 +121,13 @@ fn block_download_has_the_products_sub_blocks_or_is_not_there() {
 /// A program gets the COB-IDs with the handoff: trial, start and call back go by the same ones.
 #[test]
 fn an_update_keeps_the_cob_ids_of_the_product() {
-    let mut bench = switched_on(42, BitRate::K500);
+    let mut bench = switched_on(NODE, BitRate::K500);
     bench.machine().set_pin('C', 0, Some(true));
-    let node = canopen::NodeId::new(42).unwrap();
     for program in [firmware::APP_V1, firmware::APP_V2, firmware::APP_C] {
         let file = firmware::blocks(program);
-        let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
-        let mut session = Session::new(&mut ids, node, Timing::default());
-        let report = flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+        let options = FlashOptions::default();
+        let report = with(&mut bench, |session| flash(session, &file, &options, &mut |_| {}).unwrap());
         assert!(!report.running.unwrap().is_bootloader(), "{program}");
-        drop(session);
         // By the predefined ones nobody answers.
         assert_eq!(bench.ask(0x62A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x5AA), None, "{program}");
     }
@@ -130,21 +136,17 @@ fn an_update_keeps_the_cob_ids_of_the_product() {
 /// A released program only starts while PC0 is high; CLEAR of this product erases at once.
 #[test]
 fn a_pin_says_whether_a_program_is_valid() {
-    let mut bench = switched_on(42, BitRate::K500);
+    let mut bench = switched_on(NODE, BitRate::K500);
     bench.machine().set_pin('C', 0, Some(true));
     let file = firmware::blocks(firmware::APP_V1);
-    let node = canopen::NodeId::new(42).unwrap();
     let in_bootloader = |bench: &mut Bench| {
         let answer = bench.ask(0x32A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
         answer.unwrap() == [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]
     };
-    {
-        let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
-        let mut session = Session::new(&mut ids, node, Timing::default());
-        let options = FlashOptions::default().start(false);
-        flash(&mut session, &file, &options, &mut |_| {}).unwrap();
-        coflash_core::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
-    }
+    with(&mut bench, |session| {
+        flash(session, &file, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+        coflash_core::update::steps::release(session, 1, &mut |_| {}).unwrap();
+    });
     let restart = |bench: &mut Bench, valid: bool| {
         bench.power_off();
         bench.machine().set_pin('C', 0, Some(valid));
@@ -161,11 +163,10 @@ fn a_pin_says_whether_a_program_is_valid() {
     bench.machine().set_pin('C', 0, Some(false));
     bench.power_on();
     bench.run_ms(50);
-    let mut ids = SdoIds::new(&mut bench, 0x300, 0x480);
-    let mut session = Session::new(&mut ids, node, Timing::default());
-    session.command(1, ProgramControl::Clear).unwrap();
-    session.await_idle(1, Doing::Block(0)).unwrap();
-    drop(session);
+    with(&mut bench, |session| {
+        session.command(1, ProgramControl::Clear).unwrap();
+        session.await_idle(1, Doing::Block(0)).unwrap();
+    });
     let program = firmware::board().programs[0];
     let at = (program.base - firmware::board().chip.flash.base) as usize;
     assert!(bench.machine().flash()[at..at + 4096].iter().all(|byte| *byte == 0xFF));

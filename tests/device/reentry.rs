@@ -6,7 +6,7 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{call_back, firmware};
 use coflash_core::device::Doing;
 use coflash_core::Error;
-use emulator::machine::{Options, ResetCause, Stop};
+use emulator::machine::{ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
 
@@ -19,15 +19,7 @@ const SIGNED: u32 = 2;
 
 /// A board that runs version 1.
 fn running_board() -> Bench {
-    running_board_with(TYPICAL)
-}
-
-fn running_board_with(silicon: Silicon) -> Bench {
-    let mut bench = Bench::with(Options { silicon, ..Options::default() }).switched_on();
-    bench.install(firmware::APP_V1);
-    bench.confirm_program();
-    bench.events();
-    bench
+    crate::standby::running_board(firmware::BOOTLOADER, TYPICAL, false)
 }
 
 fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
@@ -79,7 +71,8 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
 fn each_way_back_is_short_with_the_slowest_and_the_fastest_lsi() {
     for lsi_hz in [17_000, 32_000, 47_000] {
         for (way, periods) in [(0, 0), (1, 5 + 2 * 4), (2, 0)] {
-            let mut bench = running_board_with(Silicon { lsi_hz, ..TYPICAL });
+            let mut bench =
+                crate::standby::running_board(firmware::BOOTLOADER, Silicon { lsi_hz, ..TYPICAL }, false);
             write(&mut bench, REENTRY_PATH, way).unwrap();
             bench.session().command(1, ProgramControl::StartBootloader).unwrap();
             let answered = bench.time();

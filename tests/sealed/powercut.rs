@@ -4,8 +4,8 @@
 
 use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1, STANDARD_1, STANDARD_2};
 use coflash_core::file::sealed::Sealer;
-use kit::boot::fill_journal;
 use kit::model::{until_power_cut, Cut, ModelFlash};
+use kit::rig::fill_journal;
 use shared_abi::geometry::Region;
 
 /// The number of checks: bits between 0 and 1 read differently each time.

@@ -2,10 +2,9 @@
 
 use boot_core::bootloader::{Bootloader, Choices, Config};
 use boot_core::control::{Sealed, SealedMemory};
-use boot_core::flash::{run, Flash, FlashFault, Next};
+use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, StoreError, Value};
 use shared_abi::boot_report::{BootReport, Reason};
-use shared_abi::layout::Layout;
 
 /// What a bootloader starts from, apart from its memory.
 pub struct Boot {
@@ -77,18 +76,6 @@ impl<const RENEWS: bool, const RESUMES: bool> Parameters for Store<RENEWS, RESUM
 
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         self.0.next(flash, outcome)
-    }
-}
-
-/// Stores so many values, as the boot stage does when it counts resets, so that the journal fills.
-///
-/// # Panics
-/// If the flash does not take one.
-pub fn fill_journal(flash: &mut impl Flash, layout: &Layout, stores: u32) {
-    let mut journal = Journal::open(flash, layout.parameters);
-    for count in (0..stores).rev() {
-        journal.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
-        run(flash, |flash, outcome| journal.next(flash, outcome)).expect("it is stored");
     }
 }
 

@@ -7,10 +7,10 @@ use boot_core::bootloader::{
     entries, entry_count, Bootloader, Choices, Config, Everything, Extras, PasswordObject,
 };
 use boot_core::control::{Erase, Policy, Renewal, SealedMemory, Step};
-use boot_core::flash::Flash;
+use boot_core::flash::{run, Flash};
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
-use boot_core::store::{Journal, NodeParameters, Parameters, ProgramRecord};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use canopen::device::Device;
 use canopen::lss::LssDevice;
 use canopen::od::{Address, Entry, Objects};
@@ -273,6 +273,15 @@ pub fn go_on(
         node.download_data(at, bytes).inspect_err(|_| node.download_cancel(at))?;
     }
     Ok(())
+}
+
+/// Stores so many values, as the boot stage does when it counts resets, so that the journal fills.
+pub fn fill_journal(flash: &mut impl Flash, layout: &Layout, stores: u32) {
+    let mut journal = Journal::open(flash, layout.parameters);
+    for count in (0..stores).rev() {
+        journal.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
+        run(flash, |flash, outcome| journal.next(flash, outcome)).expect("it is stored");
+    }
 }
 
 /// The stored state that would be found after a reset.
