@@ -75,11 +75,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                 let _ = if byte & 1 == 0 {
                     run(&mut target, &mut Download::new(node(), DATA, &data, config), now)
                 } else {
-                    run(
-                        &mut target,
-                        &mut Download::as_blocks(node(), DATA, &data, config, Block::default()),
-                        now,
-                    )
+                    run(&mut target, &mut Download::as_blocks(node(), DATA, &data, config), now)
                 };
             }
             210..=229 => {

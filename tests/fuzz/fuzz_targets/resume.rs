@@ -17,7 +17,7 @@ use boot_core::store::{Journal, NodeParameters};
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA, SECOND_SERVER};
-use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, Step, Transfer};
+use canopen::sdo::client::{Config as ClientConfig, Download, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{is_eighth, Input};
@@ -165,8 +165,7 @@ impl World<'_, '_> {
     fn write(&mut self, second: bool, at: Address, data: &[u8], blocks: bool, frames: u32) -> bool {
         let config = ClientConfig::default();
         let mut transfer = if blocks {
-            let block = Blocks { fallback: false, ..Blocks::default() };
-            Download::as_blocks(node(), at, data, config, block)
+            Download::as_blocks(node(), at, data, config)
         } else {
             Download::new(node(), at, data, config)
         };

@@ -35,11 +35,11 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let Some([kind, len, blksize, pst]) = input.array() else { return };
     let data = vec![0xA5; usize::from(len)];
-    let block = Block { fallback: kind & 4 != 0, blksize: blksize % 127 + 1, pst, repeat_ms: 300 };
+    let block = Block { blksize: blksize % 127 + 1, pst, repeat_ms: 300 };
     let mut delivered = Delivered::default();
     match kind & 3 {
         0 => drop(drive(&mut Download::new(node(), AT, &data, Config::default()), input)),
-        1 => drop(drive(&mut Download::as_blocks(node(), AT, &data, Config::default(), block), input)),
+        1 => drop(drive(&mut Download::as_blocks(node(), AT, &data, Config::default()), input)),
         2 => {
             let result = drive(&mut Upload::new(node(), AT, &mut delivered, Config::default()), input);
             check(result, &delivered);

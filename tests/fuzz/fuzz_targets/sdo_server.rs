@@ -78,7 +78,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     assert!(device.incoming.is_none(), "a download neither ended nor was cancelled");
 
     let data: Vec<u8> = (0..=flags).collect();
-    let (config, block) = (ClientConfig::default(), Block { fallback: false, ..Block::default() });
+    let (config, block) = (ClientConfig::default(), Block::default());
     let mut download = Download::new(node(), DOMAIN, &data, config);
     assert_eq!(run(&mut download, &mut slave, &mut device, at(now)), Ok(()));
     assert_eq!(device.domain, data);
@@ -86,7 +86,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     assert_eq!(run(&mut upload, &mut slave, &mut device, at(now)), Ok(()));
     assert_eq!(upload.into_sink(), data);
     let data: Vec<u8> = (0..u16::from(flags) * 3).map(|i| i as u8).collect();
-    let mut download = Download::as_blocks(node(), DOMAIN, &data, config, block);
+    let mut download = Download::as_blocks(node(), DOMAIN, &data, config);
     assert_eq!(run(&mut download, &mut slave, &mut device, at(now)), Ok(()));
     assert_eq!(device.domain, data);
 });

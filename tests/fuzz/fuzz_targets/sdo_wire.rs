@@ -26,7 +26,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut slave = Node::new(node(), Config { sdo, ..Config::default() });
     let mut device = Device { tells_size: kind & 4 != 0, ..Device::default() };
     let _ = slave.poll(at(0), &mut device);
-    let block = Block { fallback: kind & 8 != 0, blksize: client_blksize % 127 + 1, pst, repeat_ms: 300 };
+    let block = Block { blksize: client_blksize % 127 + 1, pst, repeat_ms: 300 };
     let config = ClientConfig::default();
     match kind & 3 {
         0 => {
@@ -36,7 +36,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
             }
         }
         1 => {
-            let mut download = Download::as_blocks(node(), AT, &data, config, block);
+            let mut download = Download::as_blocks(node(), AT, &data, config);
             if drive(&mut download, &mut slave, &mut device, input).is_ok() {
                 assert_eq!(device.domain, data);
             }

@@ -1,6 +1,6 @@
 //! What the masters send: steps of a legal master, whole or broken off, and noise between them.
 
-use canopen::sdo::client::{Block, Config, Download, SdoError, Step, Transfer};
+use canopen::sdo::client::{Config, Download, SdoError, Step, Transfer};
 use canopen::{Address, CobId, Frame, Instant};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 
@@ -129,7 +129,7 @@ impl Attack {
     fn download(&mut self, at: Address, data: Vec<u8>) -> Download<Vec<u8>> {
         let config = Config { timeout_ms: CLIENT_MS };
         if self.random.chance(80) {
-            Download::as_blocks(self.node(), at, data, config, Block { fallback: false, ..Block::default() })
+            Download::as_blocks(self.node(), at, data, config)
         } else {
             Download::new(self.node(), at, data, config)
         }

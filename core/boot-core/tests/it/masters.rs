@@ -9,7 +9,7 @@
 
 use boot_core::control::{Policy, Step as Work};
 use boot_core::store::{Journal, ProgramRecord};
-use canopen::sdo::client::{Block, Config as ClientConfig, Download, SdoError, Step, Transfer};
+use canopen::sdo::client::{Config as ClientConfig, Download, SdoError, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use kit::bench::{block_file, crc32, program, Bench as Device, CLEAR, CONTROL, DATA, DEVICE, PROGRAM};
@@ -120,10 +120,9 @@ impl Updater {
     fn turn(&mut self, world: &mut World<'_>, random: &mut Random) -> bool {
         let Some((at, data)) = self.files.get(self.at) else { return false };
         let transfer = self.transfer.get_or_insert_with(|| {
-            let block = Block { fallback: false, ..Block::default() };
             let node = NodeId::new(NODE).unwrap();
             if random.chance(80) {
-                Download::as_blocks(node, *at, data.clone(), ClientConfig::default(), block)
+                Download::as_blocks(node, *at, data.clone(), ClientConfig::default())
             } else {
                 Download::new(node, *at, data.clone(), ClientConfig::default())
             }
@@ -249,9 +248,8 @@ fn two_masters_at_once_and_whatever_else_comes() {
         let image = program(300 + random.below(2000), 0xA5);
         let blocks = block_file(&image, 256).into_iter().map(|block| (DATA, block));
         for (at, data) in [(CONTROL, vec![CLEAR])].into_iter().chain(blocks) {
-            let block = Block { fallback: false, ..Block::default() };
             let config = ClientConfig::default();
-            let mut transfer = Download::as_blocks(NodeId::new(NODE).unwrap(), at, data, config, block);
+            let mut transfer = Download::as_blocks(NodeId::new(NODE).unwrap(), at, data, config);
             world.answers.clear();
             loop {
                 match transfer.poll(world.at()) {

@@ -391,7 +391,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
 // The client.
 
 const CONFIG: Config = Config { timeout_ms: 1000 };
-const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 300 };
+const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
 const PROGRAM: Address = Address::new(0x1F50, 1);
 const DOMAIN: Address = Address::new(0x2000, 0);
 
@@ -421,7 +421,7 @@ fn ends(client: &mut impl Transfer, now: u32, frames: &[[u8; 8]], result: Result
 
 #[test]
 fn client_makes_a_block_download() {
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[granted(127)]);
     sends(&mut client, 0, &[FIRST, LAST_OF_9]);
@@ -431,7 +431,7 @@ fn client_makes_a_block_download() {
     hears(&mut client, 0, &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     // A server without CRC; sub-blocks of one segment.
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[[0xA0, 0x50, 0x1F, 1, 1, 0, 0, 0]]);
     sends(&mut client, 0, &[FIRST]);
@@ -443,9 +443,9 @@ fn client_makes_a_block_download() {
     hears(&mut client, 0, &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     // Four bytes need no segment, an empty value one empty segment.
-    let mut client = Download::as_blocks(node(), PROGRAM, [1, 2, 3, 4], CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, [1, 2, 3, 4], CONFIG);
     sends(&mut client, 0, &[[0x23, 0x50, 0x1F, 1, 1, 2, 3, 4]]);
-    let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG);
     sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
     hears(&mut client, 0, &[granted(127)]);
     sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
@@ -457,7 +457,7 @@ fn client_makes_a_block_download() {
 
 #[test]
 fn client_repeats_what_the_server_did_not_get() {
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[granted(127)]);
     sends(&mut client, 0, &[FIRST, LAST_OF_9]);
@@ -471,18 +471,18 @@ fn client_repeats_what_the_server_did_not_get() {
     // segment.
     hears(&mut client, 0, &[acked(1, 2), ENDED]);
     ends(&mut client, 0, &[], Ok(()));
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[granted(1)]);
     sends(&mut client, 0, &[FIRST]);
     hears(&mut client, 0, &[acked(1, 1), acked(1, 1)]);
     sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
-    let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG);
     sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
     hears(&mut client, 0, &[granted(127), acked(0, 127)]);
     sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
     // A server that never receives anything is given up.
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[granted(127)]);
     for _ in 0..9 {
@@ -496,51 +496,39 @@ fn client_repeats_what_the_server_did_not_get() {
 }
 
 #[test]
-fn client_falls_back_to_segments_where_it_may() {
-    let unknown = [0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x04, 0x05];
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[unknown]);
-    sends(&mut client, 0, &[[0x21, 0x50, 0x1F, 1, 9, 0, 0, 0]]);
-    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
-    hears(&mut client, 0, &[unknown]);
-    sends(&mut client, 0, &[[0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
-    // A server that names the object of the transfer before: 100 ms after its abort, if no answer comes.
+fn client_tells_a_server_without_blocks_from_other_refusals() {
+    // A server may name the object of the transfer before: 100 ms after its abort, if no answer comes.
     let misnamed = [0x80, 0x08, 0x10, 0, 0x01, 0x00, 0x04, 0x05];
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 30, &[misnamed]);
-    assert_eq!(client.poll(at(129)), Step::Wait(at(130)));
-    sends(&mut client, 130, &[[0x21, 0x50, 0x1F, 1, 9, 0, 0, 0]]);
-    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
-    hears(&mut client, 30, &[misnamed]);
-    hears(&mut client, 90, &[misnamed]);
-    sends(&mut client, 130, &[[0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
+    let unknown = [0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x04, 0x05];
+    // Aborts and their times, when the transfer ends, with which code, and whether blocks were the reason.
+    type Case<'a> = (&'a [(u32, [u8; 8])], u32, u32, bool);
+    let cases: [Case<'_>; 5] = [
+        (&[(0, unknown)], 0, 0x0504_0001, true),
+        (&[(30, misnamed)], 130, 0x0504_0001, true),
+        (&[(30, misnamed), (90, misnamed)], 130, 0x0504_0001, true),
+        (&[(0, [0x80, 0x50, 0x1F, 1, 0x22, 0x00, 0x00, 0x08])], 0, 0x0800_0022, false),
+        (&[(0, [0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06])], 0, 0x0601_0001, false),
+    ];
+    for (aborts, end, code, is_told) in cases {
+        let refused = |client: &mut dyn Transfer, initiate| {
+            assert_eq!(client.poll(at(0)), Step::Send(request(initiate)));
+            for (time, abort) in aborts {
+                client.handle(&response(*abort), at(*time));
+                assert!(end == 0 || client.poll(at(end - 1)) == Step::Wait(at(end)));
+            }
+            assert_eq!(client.poll(at(end)), Step::Done(Err(SdoError::Server(AbortCode(code)))));
+        };
+        let mut download = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
+        refused(&mut download, INITIATE_9);
+        let mut upload = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
+        refused(&mut upload, [0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]);
+        assert_eq!((download.refuses_blocks(), upload.refuses_blocks()), (is_told, is_told), "{code:X}");
+    }
     // If the answer comes, it was the abort of the transfer before.
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     sends(&mut client, 0, &[INITIATE_9]);
     hears(&mut client, 0, &[misnamed, granted(127)]);
     sends(&mut client, 101, &[FIRST, LAST_OF_9]);
-    // Not if the caller forbids it, and not for other reasons.
-    let strict = Block { fallback: false, ..BLOCK };
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, strict);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[unknown]);
-    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0504_0001))));
-    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, strict);
-    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
-    hears(&mut client, 0, &[unknown]);
-    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0504_0001))));
-    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[[0x80, 0x50, 0x1F, 1, 0x22, 0x00, 0x00, 0x08]]);
-    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0800_0022))));
-    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
-    hears(&mut client, 0, &[[0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06]]);
-    ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0601_0001))));
 }
 
 #[test]
@@ -634,7 +622,7 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
         assert_eq!(client.poll(kit::bus::at(0)), Step::Done(Err(SdoError::Client(AbortCode(code)))));
     };
     let download = |heard: &[[u8; 8]]| {
-        let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+        let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
         sends(&mut client, 0, &[INITIATE_9]);
         for bytes in heard {
             hears(&mut client, 0, &[*bytes]);

@@ -294,7 +294,7 @@ fn a_caller_can_give_up() {
 #[test]
 fn an_answer_about_another_object_is_no_answer() {
     use canopen::sdo::client::Block;
-    const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 300 };
+    const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
     let object = Address::new(0x2000, 3);
     let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
     /// A client that waits, the answer to it without the object, and what it sends next, if it has
@@ -305,12 +305,7 @@ fn an_answer_about_another_object_is_no_answer() {
         (Box::new(download(nine)), 0x60, [0; 4], Some(0x00)),
         (Box::new(upload()), 0x4F, [7, 0, 0, 0], None),
         (Box::new(upload()), 0x41, [9, 0, 0, 0], Some(0x60)),
-        (
-            Box::new(Download::as_blocks(node(), object, nine, CONFIG, BLOCK)),
-            0xA4,
-            [127, 0, 0, 0],
-            Some(0x01),
-        ),
+        (Box::new(Download::as_blocks(node(), object, nine, CONFIG)), 0xA4, [127, 0, 0, 0], Some(0x01)),
         (
             Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK)),
             0xC6,
@@ -341,10 +336,10 @@ fn an_answer_about_another_object_is_no_answer() {
 #[test]
 fn an_abort_for_another_object_is_no_answer() {
     use canopen::sdo::client::Block;
-    const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 300 };
+    const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
     let object = Address::new(0x2000, 3);
     let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
-    let block_download = || Box::new(Download::as_blocks(node(), object, nine, CONFIG, BLOCK));
+    let block_download = || Box::new(Download::as_blocks(node(), object, nine, CONFIG));
     let block_upload = || Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK));
     /// A client, and the answers after which it waits.
     type Case = (&'static str, Box<dyn Transfer>, Vec<[u8; 8]>);
@@ -431,7 +426,7 @@ fn answers_to_the_attempt_before_are_passed_over() {
     assert_eq!(client.poll(at(6)), Step::Wait(at(1005)));
     client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(7));
     sends(&mut client, 7, [0x1B, 8, 9, 0, 0, 0, 0, 0]);
-    let mut client = Download::as_blocks(node(), Address::new(0x2000, 3), &nine, CONFIG, Default::default());
+    let mut client = Download::as_blocks(node(), Address::new(0x2000, 3), &nine, CONFIG);
     sends(&mut client, 0, [0xC6, 0x00, 0x20, 3, 9, 0, 0, 0]);
     client.handle(&response([0xA4, 0x00, 0x20, 3, 127, 0, 0, 0]), at(5));
     assert_eq!(client.poll(at(5)), Step::Send(request([0x01, 1, 2, 3, 4, 5, 6, 7])));

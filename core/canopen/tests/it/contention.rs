@@ -3,7 +3,7 @@
 
 use canopen::frame::Channel;
 use canopen::od::Objects;
-use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
+use canopen::sdo::client::{Config as ClientConfig, Download, Step, Transfer};
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{Address, BitRate, CobId, Frame};
 use kit::bus::{at, node, request, response, Bench, Device, DeviceOf, Event};
@@ -534,9 +534,7 @@ fn no_lost_or_doubled_segment_makes_a_request_of_data() {
         let len = data.len();
         data[len - 7..].fill(0xEE);
         let per_mille = random.pick(&[0, 5, 50]);
-        let block = Block { fallback: false, ..Block::default() };
-        let mut client =
-            Download::as_blocks(node(), Address::new(0x1F50, 1), &data, ClientConfig::default(), block);
+        let mut client = Download::as_blocks(node(), Address::new(0x1F50, 1), &data, ClientConfig::default());
         let mut bench = Bench::with(Config { blksize: 1 + random.below(127) as u8, ..Config::DEFAULT });
         let (mut good, mut outcome) = (0, None);
         while outcome.is_none() {

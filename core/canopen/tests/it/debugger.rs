@@ -410,9 +410,8 @@ proptest! {
         if !fits {
             return Ok(());
         }
-        let block = Block { fallback: false, ..Block::default() };
         let outcome = if blocks {
-            run(&mut target, &mut Download::as_blocks(node(), DATA, &data, Config::default(), block))
+            run(&mut target, &mut Download::as_blocks(node(), DATA, &data, Config::default()))
         } else {
             run(&mut target, &mut Download::new(node(), DATA, &data, Config::default()))
         };
@@ -422,7 +421,8 @@ proptest! {
 
         command(&mut target, Kind::Read, RAM + offset, len).unwrap();
         if blocks {
-            let mut upload = Upload::as_blocks(node(), DATA, Vec::new(), Config::default(), block);
+            let mut upload =
+                Upload::as_blocks(node(), DATA, Vec::new(), Config::default(), Block::default());
             prop_assert_eq!(run(&mut target, &mut upload), Ok(()));
             prop_assert_eq!(upload.into_sink(), data);
         } else {

@@ -246,8 +246,8 @@ proptest! {
         let mut slave = Node::new(node(), Config { sdo, ..Config::default() });
         let mut device = Device { tells_size, space, ..Device::default() };
         let _ = slave.poll(at(0), &mut device);
-        let block = Block { fallback: false, blksize, pst: 0, repeat_ms: 300 };
-        let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default(), block);
+        let block = Block { blksize, pst: 0, repeat_ms: 300 };
+        let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default());
         prop_assert_eq!(run_lossy(&mut download, &mut slave, &mut device, &[]), Ok(()));
         prop_assert_eq!(&device.domain, &data);
         prop_assert_eq!(download.progress(), data.len() as u32);
@@ -270,7 +270,7 @@ proptest! {
         let mut slave = Node::new(node(), Config { sdo, ..Config::default() });
         let mut device = Device { tells_size, ..Device::default() };
         let _ = slave.poll(at(0), &mut device);
-        let block = Block { fallback: false, blksize, ..Block::default() };
+        let block = Block { blksize, ..Block::default() };
         if up {
             device.domain.clone_from(&data);
             let mut upload = Upload::as_blocks(node(), AT, Vec::new(), ClientConfig::default(), block);
@@ -278,7 +278,7 @@ proptest! {
                 prop_assert_eq!(upload.into_sink(), data);
             }
         } else {
-            let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default(), block);
+            let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default());
             if run_lossy(&mut download, &mut slave, &mut device, &fates).is_ok() {
                 prop_assert_eq!(&device.domain, &data);
             }
@@ -319,7 +319,7 @@ proptest! {
     fn lost_segments_are_repeated(data in vec(any::<u8>(), 100..800), lost in vec(2_usize..100, 1..6), up: bool) {
         let (mut slave, mut device) = slave();
         let mut segments = 0;
-        let block = Block { fallback: false, blksize: 20, ..Block::default() };
+        let block = Block { blksize: 20, ..Block::default() };
         let sdo = canopen::sdo::server::Config { blksize: 20, ..Default::default() };
         slave = Node::new(slave.id(), Config { sdo, ..Config::default() });
         let _ = slave.poll(at(0), &mut device);
@@ -337,7 +337,7 @@ proptest! {
             device.domain = upload.into_sink();
             end
         } else {
-            let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default(), block);
+            let mut download = Download::as_blocks(node(), AT, &data, ClientConfig::default());
             run_with(&mut download, &mut slave, &mut device, &mut fate, &mut |_| Fate::Well)
         };
         prop_assert_eq!(end, Ok(()));
@@ -366,7 +366,7 @@ proptest! {
             (true, false) => drive(&mut Upload::new(node(), AT, Vec::new(), config)),
             (false, false) => drive(&mut Download::new(node(), AT, [7; 50], config)),
             (true, true) => drive(&mut Upload::as_blocks(node(), AT, Vec::new(), config, block)),
-            (false, true) => drive(&mut Download::as_blocks(node(), AT, [7; 50], config, block)),
+            (false, true) => drive(&mut Download::as_blocks(node(), AT, [7; 50], config)),
         };
         prop_assert!(ended);
     }

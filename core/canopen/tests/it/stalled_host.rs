@@ -5,7 +5,7 @@
 
 use std::collections::VecDeque;
 
-use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
+use canopen::sdo::client::{Config as ClientConfig, Download, Step, Transfer};
 use canopen::sdo::server::Config;
 use canopen::{Address, BitRate, Frame};
 use kit::bus::{at, node, request, Bench};
@@ -111,8 +111,7 @@ impl Wire {
 /// A client that reads before each segment.
 fn attentive(wire: &mut Wire, data: &[u8]) -> Result<(), String> {
     let config = ClientConfig { timeout_ms: (TIMEOUT_US / 1000) as u32 };
-    let block = Block { fallback: false, ..Block::default() };
-    let mut client = Download::as_blocks(node(), Address::new(0x1F50, 1), data, config, block);
+    let mut client = Download::as_blocks(node(), Address::new(0x1F50, 1), data, config);
     loop {
         while let Some(frame) = wire.read() {
             client.handle(&frame, at((wire.now / 1000) as u32));

@@ -115,8 +115,7 @@ impl Session<'_> {
         let (sink, config, doing) = (|| Grown(Vec::new()), self.config(), Doing::Read(at));
         let by_blocks = self.transfers == Transfers::Blocks && !self.lacks_block_upload;
         if by_blocks {
-            let block = Block { fallback: false, ..Block::default() };
-            let mut upload = Upload::as_blocks(self.node, at, sink(), config, block);
+            let mut upload = Upload::as_blocks(self.node, at, sink(), config, Block::default());
             match self.run(&mut upload, doing, Patience::ForEachStep, progress) {
                 Err(Error::Refused { .. }) if upload.refuses_blocks() => {}
                 result => return result.map(|()| upload.into_sink().0),
@@ -149,8 +148,7 @@ impl Session<'_> {
             config.timeout_ms = config.timeout_ms.saturating_mul(self.sharing).min(u32::MAX / 4);
         }
         if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
-            let block = Block { fallback: false, ..Block::default() };
-            let mut download = Download::as_blocks(self.node, at, data, config, block);
+            let mut download = Download::as_blocks(self.node, at, data, config);
             let sent = self.run(&mut download, doing, Patience::ForEachStep, progress);
             self.takes_blocks |= download.progress() > 0;
             match sent {

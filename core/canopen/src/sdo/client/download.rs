@@ -4,9 +4,7 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
-use crate::sdo::client::transfer::{
-    concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer,
-};
+use crate::sdo::client::transfer::{Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use crate::time::Instant;
 
@@ -30,9 +28,7 @@ enum State {
         /// Bytes sent.
         sent: usize,
     },
-    InitiatingBlock {
-        fallback: bool,
-    },
+    InitiatingBlock,
     Blocks(SubBlock),
     /// All data have arrived; the server must confirm the end.
     EndingBlock,
@@ -60,13 +56,13 @@ impl<D: AsRef<[u8]>> Download<D> {
     }
 
     /// Writes `data` by block transfer. Up to four bytes are still sent expedited.
-    pub fn as_blocks(node: NodeId, at: Address, data: D, config: Config, block: Block) -> Self {
+    pub fn as_blocks(node: NodeId, at: Address, data: D, config: Config) -> Self {
         let mut download = Self::new(node, at, data, config);
         let len = download.data.as_ref().len();
         if !is_expedited(len) {
             let size = u32::try_from(len).ok();
             download.link.request = Some(Request::InitiateBlockDownload { at, crc: true, size });
-            download.state = State::InitiatingBlock { fallback: block.fallback };
+            download.state = State::InitiatingBlock;
         }
         download
     }
@@ -74,7 +70,7 @@ impl<D: AsRef<[u8]>> Download<D> {
     /// Whether the transfer has ended because the server does not support block transfer, as far as
     /// its abort of the initiate tells.
     pub fn refuses_blocks(&self) -> bool {
-        self.link.refused_as_unknown() && matches!(self.state, State::InitiatingBlock { .. })
+        self.link.refused_as_unknown() && matches!(self.state, State::InitiatingBlock)
     }
 
     fn answer(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
@@ -102,18 +98,12 @@ impl<D: AsRef<[u8]>> Download<D> {
                 *sent = end;
                 Ok(Next::Send(Request::DownloadSegment(segment)))
             }
-            (Some(Response::InitiateBlockDownload { at, crc, blksize }), State::InitiatingBlock { .. })
+            (Some(Response::InitiateBlockDownload { at, crc, blksize }), State::InitiatingBlock)
                 if at == self.link.at =>
             {
                 let blksize = check_blksize(blksize).map_err(SdoError::Client)?;
                 self.state = State::Blocks(SubBlock::new(crc, blksize));
                 Ok(Next::Wait)
-            }
-            (Some(Response::Abort(at, code)), State::InitiatingBlock { fallback: true })
-                if concerns(at, self.link.at) && means_unknown(code) =>
-            {
-                self.state = State::Initiating;
-                Ok(Next::Send(initiate(self.link.at, data)))
             }
             (Some(Response::AckBlockDownload(ack)), State::Blocks(sub_block)) => {
                 let arrived = sub_block.acknowledged(ack, data).map_err(SdoError::Client)?;
@@ -129,7 +119,7 @@ impl<D: AsRef<[u8]>> Download<D> {
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
             (response, State::Initiating) => self.link.too_early(response, false),
-            (response, State::InitiatingBlock { .. }) => self.link.too_early(response, true),
+            (response, State::InitiatingBlock) => self.link.too_early(response, true),
             (response, _) => self.link.unexpected(response),
         }
     }

@@ -26,8 +26,6 @@ impl Default for Config {
 /// The configuration of a block transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// Whether to start again segmented if the server does not support block transfer.
-    pub fallback: bool,
     /// Upload: segments of a sub-block, 1 to 127.
     pub blksize: u8,
     /// Upload: protocol switch threshold. Up to this many bytes the server may answer without
@@ -39,9 +37,9 @@ pub struct Block {
 }
 
 impl Default for Block {
-    /// With fallback, 127 segments, without blocks up to 21 bytes, 300 ms.
+    /// 127 segments, without blocks up to 21 bytes, 300 ms.
     fn default() -> Self {
-        Self { fallback: true, blksize: BLKSIZE_MAX, pst: 21, repeat_ms: 300 }
+        Self { blksize: BLKSIZE_MAX, pst: 21, repeat_ms: 300 }
     }
 }
 
@@ -275,6 +273,6 @@ pub(super) fn concerns(named: Address, at: Address) -> bool {
 
 /// Whether this is the abort of a server that does not support block transfer. Some servers use the
 /// general error for it.
-pub(super) fn means_unknown(code: AbortCode) -> bool {
+fn means_unknown(code: AbortCode) -> bool {
     matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
 }

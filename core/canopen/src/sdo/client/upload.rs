@@ -4,9 +4,7 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{Receiver, BLKSIZE_MAX};
-use crate::sdo::client::transfer::{
-    concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer,
-};
+use crate::sdo::client::transfer::{Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::fields;
 use crate::sdo::wire::{BlockAck, Payload, Request, Response};
 use crate::time::Instant;
@@ -181,12 +179,6 @@ impl<S: Sink> Upload<S> {
                 receiver.open(self.block.blksize);
                 self.state = State::Blocks(receiver);
                 Ok(Next::Send(Request::StartBlockUpload))
-            }
-            (Some(Response::Abort(at, code)), State::InitiatingBlock)
-                if self.block.fallback && concerns(at, self.link.at) && means_unknown(code) =>
-            {
-                self.state = State::Initiating;
-                Ok(Next::Send(Request::InitiateUpload(self.link.at)))
             }
             // The answer to the initiate of the same read before, which was given up.
             (Some(Response::InitiateUpload(..)), State::Segments { .. }) => Ok(Next::Ignore),
