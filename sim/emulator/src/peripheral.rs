@@ -9,7 +9,8 @@ pub struct Unmodelled(pub String);
 /// A memory-mapped block of registers.
 ///
 /// The machine hands in word-aligned accesses; it takes care of bytes, half-words and bit-band
-/// aliases. A model never reads a clock: `now` is the virtual time of the access.
+/// aliases. A model never reads a clock: `now` is the virtual time of the access. One in which nothing happens
+/// but by an access has neither events nor interrupts.
 pub trait Peripheral {
     /// Name as in the reference manual, for reports.
     fn name(&self) -> &'static str;
@@ -21,14 +22,20 @@ pub trait Peripheral {
     fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled>;
 
     /// Processes all events that are due up to and including `now`.
-    fn advance(&mut self, now: Time);
+    fn advance(&mut self, now: Time) {
+        let _ = now;
+    }
 
     /// The time of the next event that happens without an access, if there is one: a timer runs
     /// out, an operation ends.
-    fn next_event(&self) -> Option<Time>;
+    fn next_event(&self) -> Option<Time> {
+        None
+    }
 
     /// The NVIC lines that this block holds active (level), as interrupt numbers.
-    fn interrupts(&self, active: &mut Vec<u16>);
+    fn interrupts(&self, active: &mut Vec<u16>) {
+        let _ = active;
+    }
 
     /// System reset. The model decides what survives it (RAM, the reset flags, the watchdog's
     /// start).

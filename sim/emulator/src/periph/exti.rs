@@ -97,12 +97,6 @@ impl Peripheral for Exti {
         Ok(())
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn next_event(&self) -> Option<Time> {
-        None
-    }
-
     fn interrupts(&self, active: &mut Vec<u16>) {
         let pending = self.pr & self.imr;
         if pending != 0 {

@@ -164,14 +164,6 @@ impl Peripheral for Gpio {
         Ok(())
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn next_event(&self) -> Option<Time> {
-        None
-    }
-
-    fn interrupts(&self, _active: &mut Vec<u16>) {}
-
     fn reset(&mut self) {
         let outside = self.outside;
         *self = Self { outside, ..Self::new(self.port) };

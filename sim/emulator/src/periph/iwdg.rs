@@ -246,8 +246,6 @@ impl Peripheral for Iwdg {
         }
     }
 
-    fn interrupts(&self, _active: &mut Vec<u16>) {}
-
     fn reset(&mut self) {
         let longest_between_feeds = self.longest_between_feeds;
         *self = Self { longest_between_feeds, ..Self::new(self.silicon) };

@@ -91,14 +91,6 @@ impl Peripheral for Otg {
         Ok(())
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn next_event(&self) -> Option<Time> {
-        None
-    }
-
-    fn interrupts(&self, _active: &mut Vec<u16>) {}
-
     fn reset(&mut self) {
         *self = Self::default();
     }

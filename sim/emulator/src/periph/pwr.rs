@@ -178,14 +178,6 @@ impl Peripheral for Pwr {
         Ok(())
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn next_event(&self) -> Option<Time> {
-        None
-    }
-
-    fn interrupts(&self, _active: &mut Vec<u16>) {}
-
     /// A system reset leaves SBF alone (section 5.4.2).
     fn reset(&mut self) {
         *self = Self { csr: self.csr & CSR_SBF, ..self.fresh() };

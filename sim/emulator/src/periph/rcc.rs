@@ -433,8 +433,6 @@ impl Peripheral for Rcc {
         }
     }
 
-    fn interrupts(&self, _active: &mut Vec<u16>) {}
-
     /// System reset: everything but the reset flags, the LSI's request and the backup domain
     /// (section 7.1.1).
     fn reset(&mut self) {
