@@ -10,12 +10,8 @@ use boot_core::control::{Downloader, Policy, SealedMemory, Step};
 use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::Input;
-use coflash_core::file::block_file::Block;
-use coflash_core::file::checksum::CRC;
-use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
-use shared_abi::layout::Layout;
-
-static LAYOUT: Layout = ONE_PROGRAM;
+use kit::bench::{block, block_file, crc32, program, LAYOUT_REF as LAYOUT};
+use kit::model::{ModelFlash, CHIP};
 
 /// The largest block that the device accepts.
 const BUFFER: usize = 256;
@@ -27,7 +23,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut room = SealedMemory::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
+        Downloader::new(LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
     // Whether the SDO server has an open transfer: it only makes certain calls then.
@@ -48,7 +44,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                     _ => 0x0800_0800 + u32::from(place) * 4,
                 };
                 let data = input.take(usize::from(len)).to_vec();
-                let mut block = Block { number, flash_address: address, data: data.into() }.emit();
+                let mut block = block(number, address, &data);
                 if how & 0x10 != 0 {
                     let middle = block.len() / 2;
                     block[middle] ^= 1 << (how >> 5);
@@ -112,24 +108,17 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut room = SealedMemory::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
+        Downloader::new(LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);
-    // Initial stack pointer, reset vector, and counting bytes.
-    let mut program = vec![0; 100];
-    program[..8].copy_from_slice(&[0x00, 0xF0, 0x01, 0x20, 0x51, 0x08, 0x00, 0x08]);
-    let crc = CRC.checksum(&program);
-    let mut last = (program.len() as u32).to_le_bytes().to_vec();
-    last.extend(crc.to_le_bytes());
-    let good = [(0, 0, vec![0; 8]), (1, 0x0800_0800, program), (LAST, 0, last)];
-    for (number, flash_address, data) in good {
-        let block = Block { number, flash_address, data: data.into() }.emit();
-        assert_eq!(send(&mut device, &flash, &block), Ok(()), "block {number}");
+    let program = program(100, 0);
+    for (number, block) in block_file(&program, 100).iter().enumerate() {
+        assert_eq!(send(&mut device, &flash, block), Ok(()), "block {number}");
         settle(&mut device, &mut flash);
         assert_eq!(device.status(1), FlashStatus::OK, "block {number}");
     }
-    assert_eq!(device.identification(1), crc);
+    assert_eq!(device.identification(1), crc32(&program));
     device.command(1, ProgramControl::Start).expect("START");
     assert_ne!(device.status(1).error, Some(FlashError::NoValidProgram));
     assert!(device.take_boot_request().is_some(), "the program does not start");

@@ -9,64 +9,31 @@
 
 use std::sync::OnceLock;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
-use boot_core::control::{Policy, SealedMemory, Step as Work};
+use boot_core::bootloader::{Bootloader, Config};
+use boot_core::control::{SealedMemory, Step as Work};
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
-use boot_core::store::{Journal, NodeParameters};
-use canopen::device::Device;
-use canopen::od::{Entry, Objects};
-use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA, SECOND_SERVER};
+use boot_core::store::Journal;
+use canopen::od::Objects;
+use canopen::program::SECOND_SERVER;
 use canopen::sdo::client::{Config as ClientConfig, Download, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{is_eighth, Input};
-use coflash_core::file::block_file::Block;
-use coflash_core::file::checksum::CRC;
+use kit::bench::{self, block, crc32, CLEAR, CONTROL, DATA, DEVICE, LAYOUT, PROGRAM};
 use kit::boot::Boot;
-use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
-use shared_abi::geometry::Region;
-use shared_abi::layout::Layout;
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
+use kit::rig::{program, words, BOARD_NODE};
 
-static LAYOUT: Layout = ONE_PROGRAM;
-const PROGRAM: Region = ONE_PROGRAM.programs[0];
-const DATA: Address = Address::new(PROGRAM_DATA, 1);
-const CONTROL: Address = Address::new(PROGRAM_CONTROL, 1);
+static CONFIG: Config = bench::CONFIG;
 /// 2006h/1: the CRC of block 0, and the address.
 const PARTIAL: Address = Address::new(0x2006, 1);
-const CLEAR: u8 = 3;
 /// COB-IDs that a client may give the second server.
 const SECOND: [u16; 2] = [0x6A0, 0x6A1];
 /// The most frames of one transfer, both ways.
 const FRAMES: u32 = 20_000;
 /// The data of a block.
 const CHUNK: usize = 64;
-
-static ENTRIES: [Entry; entry_count(1, Extras::STANDARD)] = entries(1, Extras::STANDARD).entries();
-static CONFIG: Config = Config {
-    entries: &ENTRIES,
-    device: DEVICE,
-    node_id: None,
-    layout: &LAYOUT,
-    supports: |_| true,
-    boot_up_emergency: false,
-    download: Policy::DEFAULT,
-    password: b"",
-};
-const DEVICE: Device = Device {
-    device_type: 0x1000_0000,
-    name: "model",
-    hardware_version: "0",
-    software_version: "0",
-    heartbeat_ms: 0,
-    vendor_id: 0,
-    product_code: 0,
-    revision: 0,
-    serial_number: 0,
-};
-
-/// Node-ID and bit rate as stored.
-const STORED: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 
 fn node() -> NodeId {
     NodeId::new(5).expect("1 to 127")
@@ -81,20 +48,14 @@ struct File {
 impl File {
     /// From the middle of a sector to the middle of another one.
     fn new(len: usize, seed: u8) -> Self {
-        let mut image: Vec<u8> =
-            (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
-        image[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
-        image[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
+        let image = program(PROGRAM, 0, len, seed);
         // Block 0 with an identity: reserved word, vendor-ID, product code (L-1112d_10, figure 13).
-        let identity: Vec<u8> = [len as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
-        let mut blocks = vec![Block { number: 0, flash_address: 0, data: identity.into() }.emit()];
+        let size = len as u32;
+        let mut blocks = vec![block(0, 0, &words(&[size, 0, 0]))];
         for (number, data) in (0..).zip(image.chunks(CHUNK)) {
-            let flash_address = PROGRAM.base + number * CHUNK as u32;
-            blocks.push(Block { number: number + 1, flash_address, data: data.into() }.emit());
+            blocks.push(block(number + 1, PROGRAM.base + number * CHUNK as u32, data));
         }
-        let last: Vec<u8> =
-            [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
-        blocks.push(Block { number: u32::MAX, flash_address: 0, data: last.into() }.emit());
+        blocks.push(block(u32::MAX, 0, &words(&[size, crc32(&image)])));
         Self { image, blocks }
     }
 
@@ -223,7 +184,7 @@ struct Host {
 fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool {
     let mut buffer = [0; 256];
     let mut room = Box::<SealedMemory>::default();
-    let device = Boot::new(&CONFIG, STORED).on(flash, &mut buffer, room.sealed());
+    let device = Boot::new(&CONFIG, BOARD_NODE).on(flash, &mut buffer, room.sealed());
     let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
     let mut world = World { device, slave, now: 0, answers: Default::default() };
     world.turn();
@@ -315,7 +276,7 @@ fn is_in_flash(flash: &mut ModelFlash) {
     let mut room = Box::<SealedMemory>::default();
     let mut bytes = [0; 8];
     {
-        let mut device = Boot::new(&CONFIG, STORED).on::<_, 1>(&mut *flash, &mut buffer, room.sealed());
+        let mut device = Boot::new(&CONFIG, BOARD_NODE).on::<_, 1>(&mut *flash, &mut buffer, room.sealed());
         assert_eq!(device.read(PARTIAL, &mut bytes), Ok(8));
     }
     let [id, end] = [0, 4].map(|at| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")));
@@ -359,7 +320,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut buffer = [0; 256];
     let mut room = Box::<SealedMemory>::default();
     {
-        let device = Boot::new(&CONFIG, STORED).on(&mut flash, &mut buffer, room.sealed());
+        let device = Boot::new(&CONFIG, BOARD_NODE).on(&mut flash, &mut buffer, room.sealed());
         let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
         let mut world = World { device, slave, now: 0, answers: Default::default() };
         world.turn();

@@ -10,34 +10,21 @@
 
 use std::sync::OnceLock;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::control::{Policy, SealedMemory, Step};
+use boot_core::bootloader::Bootloader;
+use boot_core::control::{SealedMemory, Step};
 use boot_core::crc::CrcKind;
-use boot_core::policy::SealPolicy;
-use boot_core::profile::Profile;
 use boot_core::program::verify;
-use boot_core::store::{Journal, NodeParameters};
-use canopen::device::Device;
-use canopen::od::{Entry, Objects};
-use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA};
-use canopen::{Address, BitRate, NodeId};
+use boot_core::store::Journal;
+use canopen::od::Objects;
 use coboot_fuzz::{is_eighth, Input};
 use coflash_core::file::sealed::{hash, key_block, Kek, Sealer, SigningKey};
+use kit::bench::{CLEAR, CONTROL, DATA, LAYOUT, PROGRAM, STATUS};
 use kit::boot::Boot;
-use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
+use kit::model::{ModelFlash, CHIP};
+use kit::rig::sealed::STANDARD_1;
+use kit::rig::{BOARD_NODE, PRODUCT_CODE, VENDOR_ID};
 use seal::wire::{head_size, Head, DOMAIN, HASH};
-use shared_abi::geometry::Region;
-use shared_abi::layout::Layout;
 
-static LAYOUT: Layout = ONE_PROGRAM;
-const PROGRAM: Region = ONE_PROGRAM.programs[0];
-const DATA: Address = Address::new(PROGRAM_DATA, 1);
-const CONTROL: Address = Address::new(PROGRAM_CONTROL, 1);
-const STATUS: Address = Address::new(FLASH_STATUS, 1);
-const CLEAR: u8 = 3;
-const VENDOR_ID: u32 = 0x319;
-const PRODUCT_CODE: u32 = 0x4_0001;
-const PROFILE: Profile = Profile::STANDARD;
 /// An Ed25519 signature with its header, at the end of a head with one signer.
 const SIGNATURE: usize = 72;
 /// The hash of the first chunk, in the manifest.
@@ -46,38 +33,6 @@ const CHAIN: usize = 72;
 const PAYLOAD: usize = 36;
 /// The binary logarithm of a chunk's payload, in the manifest.
 const CHUNK: usize = 25;
-
-static ENTRIES: [Entry; entry_count(1, PROFILE.extras)] = entries(1, PROFILE.extras).entries();
-static CONFIG: Config = Config {
-    entries: &ENTRIES,
-    device: Device {
-        device_type: PROFILE.device_type,
-        name: "sealed",
-        hardware_version: "0",
-        software_version: "0",
-        heartbeat_ms: 0,
-        vendor_id: VENDOR_ID,
-        product_code: PRODUCT_CODE,
-        revision: 0x1_0002,
-        serial_number: 0,
-    },
-    node_id: PROFILE.node_id,
-    layout: &LAYOUT,
-    supports: |_| true,
-    boot_up_emergency: false,
-    download: Policy {
-        identity: Some((VENDOR_ID, PRODUCT_CODE)),
-        seal: SealPolicy {
-            vendor_id: VENDOR_ID,
-            product_code: PRODUCT_CODE,
-            revision: 0x1_0002,
-            unique_id: || *b"unique id 96",
-            ..SealPolicy::NONE
-        },
-        ..PROFILE.download
-    },
-    password: PROFILE.password,
-};
 
 /// The keys of the device, an image for it, and the image sealed in every form.
 struct Made {
@@ -169,8 +124,7 @@ fn device<'b, 'f>(
     buffer: &'b mut [u8],
     room: &'b mut SealedMemory,
 ) -> Sealed<'b, 'f> {
-    let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(&CONFIG, node).on(flash, buffer, room.sealed())
+    Boot::new(&STANDARD_1.config, BOARD_NODE).on(flash, buffer, room.sealed())
 }
 
 fn settle(device: &mut Sealed<'_, '_>) {

@@ -7,62 +7,34 @@
 //! a program. A wrong password never unlocks anything.
 #![cfg_attr(fuzzing, no_main)]
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::control::{Policy, Sealed, Step};
-use boot_core::profile::Profile;
-use boot_core::store::Journal;
-use boot_core::store::NodeParameters;
-use canopen::device::Device;
-use canopen::od::{Entry, Objects};
-use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLOCK_FIRMWARE};
-use canopen::{AbortCode, Address, BitRate, Instant, NodeId};
-use coboot_fuzz::Input;
-use kit::boot::Boot;
-use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
-use shared_abi::layout::Layout;
+use std::sync::OnceLock;
 
-static LAYOUT: Layout = TWO_PROGRAMS;
+use boot_core::bootloader::{Bootloader, Config};
+use boot_core::control::{Policy, Sealed, Step};
+use boot_core::store::Journal;
+use canopen::od::Objects;
+use canopen::program::{ENABLE_FLASH, UNLOCK, UNLOCK_FIRMWARE};
+use canopen::{AbortCode, Address, Instant};
+use coboot_fuzz::Input;
+use kit::bench::{CLEAR, CONTROL, DATA};
+use kit::boot::Boot;
+use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS as LAYOUT};
+use kit::rig::{Setup, BOARD_NODE, ESACADEMY_2, LIFT_2, STANDARD_2};
 
 const PROGRAMS: usize = 2;
-const DATA: Address = Address::new(PROGRAM_DATA, 1);
-const CLEAR: u8 = 3;
 
-macro_rules! config {
-    ($profile:expr) => {{
-        const PROFILE: Profile = $profile;
-        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, PROFILE.extras)] =
-            entries(PROGRAMS as u8, PROFILE.extras).entries();
-        static CONFIG: Config = Config {
-            entries: &ENTRIES,
-            device: Device {
-                device_type: PROFILE.device_type,
-                name: "model",
-                hardware_version: "0",
-                software_version: "0",
-                heartbeat_ms: 0,
-                vendor_id: 1,
-                product_code: 2,
-                revision: 0,
-                serial_number: 0,
-            },
-            node_id: PROFILE.node_id,
-            layout: &LAYOUT,
-            supports: |_| true,
-            boot_up_emergency: false,
-            download: Policy { identity: Some((1, 2)), ..PROFILE.download },
-            password: PROFILE.password,
-        };
-        &CONFIG
-    }};
+fn configs() -> &'static [Config; 3] {
+    static CONFIGS: OnceLock<[Config; 3]> = OnceLock::new();
+    let of = |Setup { config, .. }: &Setup| {
+        let download = Policy { identity: Some((1, 2)), ..config.download };
+        Config { download, ..*config }
+    };
+    CONFIGS.get_or_init(|| [&STANDARD_2, &ESACADEMY_2, &LIFT_2].map(of))
 }
 
 coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
-    let config = match input.byte().unwrap_or(0) % 3 {
-        0 => config!(Profile::STANDARD),
-        1 => config!(Profile::ESACADEMY),
-        _ => config!(Profile::LIFT),
-    };
+    let config = &configs()[usize::from(input.byte().unwrap_or(0) % 3)];
     let mut flash = ModelFlash::new(&CHIP);
     session(config, &mut flash, &mut input);
     flash.power_on();
@@ -74,8 +46,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
 
     // A bootloader without passwords can use the resulting flash.
     let mut buffer = [0; 1024];
-    let mut device = device(config!(Profile::STANDARD), &mut flash, &mut buffer);
-    device.write(Address::new(PROGRAM_CONTROL, 1), &[CLEAR]).expect("CLEAR");
+    let mut device = device(&configs()[0], &mut flash, &mut buffer);
+    device.write(CONTROL, &[CLEAR]).expect("CLEAR");
     settle(&mut device);
     let mut image = vec![0x5A; 700];
     image[..8].copy_from_slice(&[0x00, 0xF0, 0x01, 0x20, 0x51, 0x09, 0x00, 0x08]);
@@ -88,15 +60,14 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     }
     device.download_end(DATA).expect("a good image");
     settle(&mut device);
-    device.write(Address::new(PROGRAM_CONTROL, 1), &[1]).expect("START");
+    device.write(CONTROL, &[1]).expect("START");
     assert!(device.take_boot_request().is_some(), "the program does not start");
 });
 
 type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
-    let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(config, node).on(flash, buffer, Sealed::NONE)
+    Boot::new(config, BOARD_NODE).on(flash, buffer, Sealed::NONE)
 }
 
 fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_>) {
@@ -135,7 +106,7 @@ fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_
             160..=179 => {
                 let Some([value]) = input.array() else { break };
                 if !open {
-                    let _ = device.write(Address::new(PROGRAM_CONTROL, 1), &[value]);
+                    let _ = device.write(CONTROL, &[value]);
                 }
             }
             180..=199 => {
