@@ -3,12 +3,11 @@
 
 use core::task::Poll;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
-use boot_core::canopen::device::Device as Identity;
+use boot_core::bootloader::{Bootloader, Config};
 use boot_core::canopen::lss::LssDevice;
-use boot_core::canopen::od::{Address, Entry, Objects};
+use boot_core::canopen::od::{Address, Objects};
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
-use boot_core::control::{Erase, Policy, SealedMemory, Step};
+use boot_core::control::{Policy, SealedMemory, Step};
 use boot_core::crc::CrcKind;
 use boot_core::crc32;
 use boot_core::decision::{self, decide, Autostart, BootDecision, Circumstances};
@@ -21,7 +20,8 @@ use shared_abi::layout::Layout;
 
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
-use kit::rig::go_on;
+use kit::rig::{go_on, AT_ONCE_2, ESACADEMY_2, LIFT_2, STANDARD_2};
+pub use kit::rig::{PRODUCT_CODE, VENDOR_ID};
 
 /// Seed of the program before an update.
 pub const OLD: u8 = 0xA3;
@@ -32,65 +32,21 @@ pub const NEW: u8 = 0xB7;
 pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
-static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Extras::STANDARD)] =
-    entries(PROGRAMS as u8, Extras::STANDARD).entries();
 /// 6005h/1.
 const LIFT_PASSWORD: Address = Address::new(0x6005, 1);
 
-/// The target of the programs.
-pub const VENDOR_ID: u32 = 0x0000_0319;
-/// See [`VENDOR_ID`].
-pub const PRODUCT_CODE: u32 = 0x0004_0001;
-
-const CONFIG: Config = Config {
-    entries: &ENTRIES,
-    device: Identity {
-        device_type: 0x1000_0000,
-        name: "model",
-        hardware_version: "0",
-        software_version: "0",
-        heartbeat_ms: 0,
-        vendor_id: VENDOR_ID,
-        product_code: PRODUCT_CODE,
-        revision: 0,
-        serial_number: 0,
-    },
-    layout: &LAYOUT,
-    supports: |_| true,
-    node_id: None,
-    password: b"",
-    boot_up_emergency: false,
-    download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
-};
-static SOUND: Config = CONFIG;
 /// A lift: program 2 is a set of parameters, and a download replaces what is there.
 static LIFT: Config = Config {
-    download: Policy { data: Some(2), replaces: true, read_back: true, ..CONFIG.download },
-    ..CONFIG
+    download: Policy { data: Some(2), replaces: true, read_back: true, ..STANDARD_2.config.download },
+    ..STANDARD_2.config
 };
 /// A lift that requires its password.
 static LOCKED_LIFT: Config = Config {
-    entries: {
-        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::LIFT.extras)] =
-            entries(PROGRAMS as u8, Profile::LIFT.extras).entries();
-        &ENTRIES
-    },
+    entries: LIFT_2.config.entries,
     download: Policy { locked: true, ..LIFT.download },
     password: Profile::LIFT.password,
-    ..CONFIG
+    ..STANDARD_2.config
 };
-/// A password for each program, which makes it invalid.
-static ESACADEMY: Config = Config {
-    entries: {
-        static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Profile::ESACADEMY.extras)] =
-            entries(PROGRAMS as u8, Profile::ESACADEMY.extras).entries();
-        &ENTRIES
-    },
-    download: Policy { identity: CONFIG.download.identity, ..Profile::ESACADEMY.download },
-    password: Profile::ESACADEMY.password,
-    ..CONFIG
-};
-static HASTY: Config = Config { download: Policy { erase: |_| Erase::AtOnce, ..CONFIG.download }, ..CONFIG };
 
 /// The boot decision of these tests: program 1 starts by itself, and there is no rescue window.
 pub const DECISION: decision::Policy = decision::Policy {
@@ -249,7 +205,8 @@ impl Device {
 
     /// Bootloader mode, with a host that talks to it.
     pub fn host<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
-        self.host_of(if self.bug == Some(Bug::EraseBeforeCheck) { &HASTY } else { &SOUND }, talk)
+        let setup = if self.bug == Some(Bug::EraseBeforeCheck) { &AT_ONCE_2 } else { &STANDARD_2 };
+        self.host_of(&setup.config, talk)
     }
 
     /// The same for the bootloader of a lift.
@@ -264,7 +221,7 @@ impl Device {
 
     /// The same for the bootloader of ESAcademy.
     pub fn host_of_esacademy<R>(&mut self, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
-        self.host_of(&ESACADEMY, talk)
+        self.host_of(&ESACADEMY_2.config, talk)
     }
 
     fn host_of<R>(&mut self, config: &'static Config, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
@@ -284,12 +241,7 @@ pub struct Host<'b, 'f> {
 impl Host<'_, '_> {
     /// Runs until there is no work.
     pub fn settle(&mut self) {
-        for _ in 0..1_000_000 {
-            if self.node.step() == Step::Idle {
-                return;
-            }
-        }
-        panic!("the work does not end");
+        assert!((0..1_000_000).any(|_| self.node.step() == Step::Idle), "the work does not end");
     }
 
     /// 1F57h of a program.
@@ -344,15 +296,7 @@ impl Host<'_, '_> {
     pub fn broken_off(&mut self, program: u8, data: &[u8], sent: usize, steps: u32) -> Result<(), String> {
         let at = Address::new(0x1F50, program);
         self.node.download_start(at, Some(data.len() as u32)).map_err(abort_text)?;
-        for segment in data[..sent].chunks(7) {
-            while self.node.download_space(at, false) < segment.len() {
-                self.node.step();
-            }
-            if let Err(abort) = self.node.download_data(at, segment) {
-                self.node.download_cancel(at);
-                return Err(abort_text(abort));
-            }
-        }
+        go_on(&mut self.node, program, &data[..sent], 7).map_err(abort_text)?;
         for _ in 0..steps {
             self.node.step();
         }
