@@ -214,10 +214,6 @@ impl Maker for Standard {
             _ => Deed::Nothing,
         }))
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 #[test]

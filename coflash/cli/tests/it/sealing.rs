@@ -834,14 +834,6 @@ impl Maker for Told {
         let all = if running == BOOTLOADER { &self.bootloader } else { &self.application };
         all.iter().find(|(own, _)| *own == at).map(|(_, value)| Ok(value.clone()))
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// Runs a command on such a device.

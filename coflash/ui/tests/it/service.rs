@@ -34,14 +34,6 @@ impl Maker for Plate {
         };
         Some(Ok(value.to_le_bytes().to_vec()))
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// A device with another program; its serial number is 1000 and its node-ID.

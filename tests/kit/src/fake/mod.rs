@@ -53,11 +53,17 @@ pub enum Blocks {
 /// Objects of another manufacturer, which precede the fake's own.
 pub trait Maker: Send {
     /// The value of an object while this device type runs; `None` for the fake's own value.
-    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>>;
-    /// The result of writing a value.
-    fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>>;
-    /// The state after NMT reset node: node-ID and device type.
-    fn reset(&mut self, running: u32) -> Option<(u8, u32)>;
+    fn value(&mut self, _at: (u16, u8), _running: u32) -> Option<Result<Vec<u8>, u32>> {
+        None
+    }
+    /// The result of writing a value; `None` for the fake's own.
+    fn write(&mut self, _at: (u16, u8), _data: &[u8], _running: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+    /// The state after NMT reset node: node-ID and device type; `None` for the fake's own.
+    fn reset(&mut self, _running: u32) -> Option<(u8, u32)> {
+        None
+    }
 }
 
 /// The action of a device after its answer.

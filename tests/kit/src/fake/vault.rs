@@ -38,8 +38,4 @@ impl Maker for Vault {
         *self.kept.lock().unwrap() = data.to_vec();
         Some(if self.status == 0 { Ok(Deed::Nothing) } else { Err(0x0800_0020) })
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }

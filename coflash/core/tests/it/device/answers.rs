@@ -161,14 +161,6 @@ impl Maker for Peculiar {
     fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
         (at == self.0).then(|| self.1.clone())
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// A device that says nothing about an object that it does not have still answers.

@@ -32,14 +32,6 @@ impl Maker for Plate {
             _ => None,
         }
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 fn device(node: u8, product: u32) -> Fake {
@@ -252,14 +244,6 @@ impl Maker for Exchanged {
         self.is_first &= at != (0x1018, 4);
         value
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// All devices of a program are compared before the first is written. Another type of device that comes after
@@ -290,14 +274,6 @@ impl Maker for Sparse {
     fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
         let is_application = running == APPLICATION;
         if is_application { &mut self.application } else { &mut self.bootloader }.value(at, running)
-    }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
     }
 }
 

@@ -115,12 +115,6 @@ fn a_label_that_fits_goes_in_and_is_in_block_0() {
         fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
             (at == (0x1018, 2)).then_some(Err(0x0609_0011))
         }
-        fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-            None
-        }
-        fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-            None
-        }
     }
     let mut fake = Fake::new(APPLICATION);
     fake.maker = Some(Box::new(Reticent));
@@ -136,12 +130,6 @@ impl Maker for Other {
             return None;
         }
         self.0.iter().find(|(other, _)| *other == at).map(|(_, value)| Ok(value.to_vec()))
-    }
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
     }
 }
 
@@ -245,10 +233,6 @@ impl Maker for Told2004 {
         // A whole image in one download; the fake takes blocks by itself.
         (at == (0x1F50, 1) && data.starts_with(&0x2001_FFC0_u32.to_le_bytes())).then_some(Ok(Deed::Nothing))
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// A device whose program lies at `base`, as 2004h reports it.
@@ -326,14 +310,6 @@ impl Maker for Sealed {
             _ => return None,
         };
         (self.0.contains(&running) || at.0 == 0x2004).then_some(Ok(value))
-    }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
     }
 }
 

@@ -210,10 +210,6 @@ impl Maker for Begun {
         }
         None
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 /// The same of a download that goes on and has no data yet: the old program is there if its CRC is.

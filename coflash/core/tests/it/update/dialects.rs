@@ -350,10 +350,6 @@ impl Maker for EsAcademy {
             _ => Err(NO_OBJECT),
         })
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 #[test]
@@ -450,10 +446,6 @@ impl Maker for Standard {
             ((0x1F50, 1), _) => Err(NOT_NOW),
             _ => Err(NO_OBJECT),
         })
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
     }
 }
 

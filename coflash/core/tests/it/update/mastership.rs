@@ -50,10 +50,6 @@ impl Maker for Lift {
             _ => Ok(Deed::Nothing),
         })
     }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 fn lift() -> Fake {

@@ -275,14 +275,6 @@ impl Maker for Told {
             _ => None,
         }
     }
-
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
-        None
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
-    }
 }
 
 #[test]

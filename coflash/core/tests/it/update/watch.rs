@@ -216,17 +216,9 @@ fn a_death_in_a_trial_stops_no_other_device() {
 struct Elsewhere(u8);
 
 impl Maker for Elsewhere {
-    fn value(&mut self, _: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
-        None
-    }
-
     fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>> {
         let starts = running == BOOTLOADER && at == (0x1F51, 1) && data == [1];
         starts.then_some(Ok(Deed::Restart(self.0, APPLICATION)))
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        None
     }
 }
 
