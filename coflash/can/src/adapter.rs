@@ -76,49 +76,34 @@ pub enum Met {
     Disturbed,
 }
 
-impl<A: Adapter + ?Sized> Adapter for &mut A {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        (**self).send(frame)
-    }
+/// An adapter by a pointer to it.
+macro_rules! by_pointer {
+    ($($pointer:ty),*) => {$(
+        impl<A: Adapter + ?Sized> Adapter for $pointer {
+            fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+                (**self).send(frame)
+            }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        (**self).receive(timeout)
-    }
+            fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+                (**self).receive(timeout)
+            }
 
-    fn now(&self) -> Duration {
-        (**self).now()
-    }
+            fn now(&self) -> Duration {
+                (**self).now()
+            }
 
-    fn health(&mut self) -> Option<Health> {
-        (**self).health()
-    }
+            fn health(&mut self) -> Option<Health> {
+                (**self).health()
+            }
 
-    fn group(&mut self) -> Option<&mut dyn Group> {
-        (**self).group()
-    }
+            fn group(&mut self) -> Option<&mut dyn Group> {
+                (**self).group()
+            }
+        }
+    )*};
 }
 
-impl<A: Adapter + ?Sized> Adapter for Box<A> {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        (**self).send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        (**self).receive(timeout)
-    }
-
-    fn now(&self) -> Duration {
-        (**self).now()
-    }
-
-    fn health(&mut self) -> Option<Health> {
-        (**self).health()
-    }
-
-    fn group(&mut self) -> Option<&mut dyn Group> {
-        (**self).group()
-    }
-}
+by_pointer!(&mut A, Box<A>);
 
 /// The URLs that [`open`](super::open()) accepts, for messages and help texts.
 pub const URLS: &str = "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
