@@ -105,6 +105,15 @@ impl Drive {
         (path, word(&status["execution"]), word(&status["result"]["finished"]))
     }
 
+    /// A deployment that is fetched.
+    #[track_caller]
+    fn fetch(&mut self, deployment: &Value) {
+        self.deploy(deployment);
+        self.feedback();
+        assert!(matches!(self.next(), Step::Fetch(_)));
+        self.controller.fetched(self.now, Piece::Whole);
+    }
+
     /// From the first poll to the order to flash.
     #[track_caller]
     fn go_to_flash(&mut self) -> Flash {
@@ -219,10 +228,7 @@ fn what_a_restart_interrupted_goes_on_whatever_the_window() {
     );
     drive.next();
     let mut drive = drive.restarted();
-    drive.deploy(&deployment("8", "forced"));
-    drive.feedback();
-    drive.next();
-    drive.controller.fetched(drive.now, Piece::Whole);
+    drive.fetch(&deployment("8", "forced"));
     drive.deploy(&deployment("8", "forced"));
     assert!(matches!(drive.next(), Step::Flash(flash) if flash.kept));
     // If the server wants it no more, the people must know.
@@ -248,10 +254,7 @@ fn a_cancellation_is_accepted_until_the_device_is_changed() {
     assert_eq!(cancelled(&mut Drive::new()), accepted);
     // While the file is fetched, and when it is there.
     let mut drive = Drive::new();
-    drive.deploy(&deployment("8", "forced"));
-    drive.feedback();
-    drive.next();
-    drive.controller.fetched(drive.now, Piece::Whole);
+    drive.fetch(&deployment("8", "forced"));
     assert_eq!(cancelled(&mut drive), accepted);
     drive.poll(&[]);
     assert!(drive.controller.is_settled(drive.now));
@@ -270,10 +273,7 @@ fn a_cancellation_is_accepted_until_the_device_is_changed() {
 #[test]
 fn a_deployment_that_is_gone_when_the_file_is_there_is_not_flashed() {
     let mut drive = Drive::new();
-    drive.deploy(&deployment("8", "forced"));
-    drive.feedback();
-    drive.next();
-    drive.controller.fetched(drive.now, Piece::Whole);
+    drive.fetch(&deployment("8", "forced"));
     drive.poll(&[("deploymentBase", "/d")]);
     assert_eq!(drive.asks(), Request::Get("/d".into()));
     drive.answer(404, &json!({}));
@@ -291,10 +291,7 @@ fn a_held_deployment_is_fetched_and_waits() {
         [(rules(), deployment("8", "skip")), (rules(), window), (hold, deployment("8", "attempt"))]
     {
         let mut drive = Drive::with(rules, Record::new(BASE));
-        drive.deploy(&held);
-        drive.feedback();
-        assert!(matches!(drive.next(), Step::Fetch(_)));
-        drive.controller.fetched(drive.now, Piece::Whole);
+        drive.fetch(&held);
         drive.deploy(&held);
         assert_eq!(drive.feedback(), told("deploymentBase/8", "downloaded", "none"), "{held}");
         assert!(drive.controller.is_settled(drive.now));
@@ -304,10 +301,7 @@ fn a_held_deployment_is_fetched_and_waits() {
         assert!(matches!(drive.next(), Step::Flash(_)), "{held}");
     }
     let mut drive = Drive::new();
-    drive.deploy(&deployment("8", "attempt"));
-    drive.feedback();
-    drive.next();
-    drive.controller.fetched(drive.now, Piece::Whole);
+    drive.fetch(&deployment("8", "attempt"));
     drive.deploy(&deployment("8", "attempt"));
     assert!(matches!(drive.next(), Step::Flash(_)), "by default what is not forced is done, too");
     // A deployment that is not even to be fetched.
@@ -660,10 +654,7 @@ fn the_agent_confirms_only_if_it_is_told_to() {
 #[test]
 fn a_state_that_cannot_be_written_keeps_the_device_untouched() {
     let mut drive = Drive::new();
-    drive.deploy(&deployment("8", "forced"));
-    drive.feedback();
-    drive.next();
-    drive.controller.fetched(drive.now, Piece::Whole);
+    drive.fetch(&deployment("8", "forced"));
     drive.deploy(&deployment("8", "forced"));
     for _ in 0..5 {
         let step = drive.controller.next(drive.now);
