@@ -34,8 +34,6 @@ struct Story<'a> {
     act: &'a dyn Fn(&mut Host<'_>),
     /// Whether the counter is raised at the confirmation of the program.
     with_confirmation: bool,
-    /// Whether the recovery is cut, too.
-    twice: bool,
 }
 
 /// The state that was found.
@@ -49,7 +47,12 @@ struct Seen {
     raised_first: u32,
 }
 
-impl Story<'_> {
+impl<'a> Story<'a> {
+    /// An update.
+    fn update(before: Device, old: Option<&'a Made>, new: &'a Made, act: &'a dyn Fn(&mut Host<'_>)) -> Self {
+        Self { before, old, new: Some(new), act, with_confirmation: false }
+    }
+
     /// The properties at any time; `floor` is the previous counter. With a bit between 0 and 1, the
     /// new counter may read as if it were stored: it only counts after its program is stored.
     fn look(&self, device: &Device, floor: u32, seen: &mut Seen, told: &str) -> u32 {
@@ -141,7 +144,7 @@ impl Story<'_> {
                 let rest = self.ends(&after, &told);
                 // And again, at an operation of the second attempt that differs from point to
                 // point.
-                if rest > 0 && self.twice {
+                if rest > 0 {
                     let second = 1 + (operation * 7 + kind as u32 * 13) % rest;
                     let cut = CUTS[(kind + 3) % CUTS.len()];
                     let told = format!("{told}, then {cut:?} at operation {second}");
@@ -174,14 +177,9 @@ fn an_update_leaves_the_old_program_none_or_the_new_one() {
     for (form, len) in [((false, false), 560), ((true, true), 900)] {
         let old = made(&STANDARD_1, (false, false), 600, 0xA3, 5);
         let new = made(&STANDARD_1, form, len, 0xB7, 7);
-        let seen = Story {
-            before: with(&STANDARD_1, Some(&old)),
-            old: Some(&old),
-            new: Some(&new),
-            act: &|host| host.install(1, &new.file),
-            with_confirmation: false,
-            twice: true,
-        }
+        let seen = Story::update(with(&STANDARD_1, Some(&old)), Some(&old), &new, &|host| {
+            host.install(1, &new.file)
+        })
         .prove("update");
         assert!(seen.old > 0 && seen.new > 0 && seen.none > 0 && seen.raised_first > 0, "{seen:?}");
     }
@@ -211,15 +209,7 @@ fn and_while_the_journal_changes_over() {
         if changed > 3 {
             continue;
         }
-        Story {
-            before,
-            old: Some(&old),
-            new: Some(&new),
-            act: &|host| host.install(1, &new.file),
-            with_confirmation: false,
-            twice: true,
-        }
-        .prove("changing over");
+        Story::update(before, Some(&old), &new, &|host| host.install(1, &new.file)).prove("changing over");
     }
     assert!(changed > 2, "{changed}");
 }
@@ -227,29 +217,17 @@ fn and_while_the_journal_changes_over() {
 #[test]
 fn a_first_image_leaves_none_or_all() {
     let new = made(&STANDARD_1, (true, true), 560, 0xB7, 7);
-    let seen = Story {
-        before: with(&STANDARD_1, None),
-        old: None,
-        new: Some(&new),
-        act: &|host| host.install(1, &new.file),
-        with_confirmation: false,
-        twice: true,
-    }
-    .prove("first image");
+    let seen = Story::update(with(&STANDARD_1, None), None, &new, &|host| host.install(1, &new.file))
+        .prove("first image");
     assert!(seen.new > 0 && seen.none > 0 && seen.raised_first > 0 && seen.old == 0, "{seen:?}");
 }
 
 #[test]
 fn the_same_image_again_can_be_cut_anywhere() {
     let same = made(&STANDARD_1, (true, true), 560, 0xB7, 7);
-    let seen = Story {
-        before: with(&STANDARD_1, Some(&same)),
-        old: Some(&same),
-        new: Some(&same),
-        act: &|host| host.install(1, &same.file),
-        with_confirmation: false,
-        twice: true,
-    }
+    let seen = Story::update(with(&STANDARD_1, Some(&same)), Some(&same), &same, &|host| {
+        host.install(1, &same.file)
+    })
     .prove("same image");
     assert_eq!((seen.none, seen.old), (0, 0), "{seen:?}");
 }
@@ -286,7 +264,7 @@ fn with_confirmation_a_proved_counter_stays() {
     for (name, act, new) in stories {
         let before = confirmed();
         let start = before.chip.model().clone();
-        let story = Story { before, old: Some(&old), new, act, with_confirmation: true, twice: true };
+        let story = Story { before, old: Some(&old), new, act, with_confirmation: true };
         story.prove(name);
         let operations = story.ends(&start, name);
         for operation in 1..=operations {

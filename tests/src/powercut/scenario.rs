@@ -132,27 +132,34 @@ fn install(device: &mut Device, number: u8, seed: u8, signed: bool) {
     }
 }
 
-/// An update of program 1 to the new program.
-fn update(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
-    download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY])))?;
+/// The new program is there, and is signed.
+fn release(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
     tell(allowed(&[STAY, START_NEW]));
     device.host(|host| host.command(1, SET_SIGNATURE))?;
     tell(allowed(&[START_NEW]));
     Ok(())
 }
 
-/// Two CLEARs, a reset, and the new program without CLEAR.
-fn erase_and_install(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+/// An update of program 1 to the new program.
+fn update(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    download(device, 1, &good(1, NEW), || tell(allowed(&[START_OLD, STAY])))?;
+    release(device, tell)
+}
+
+/// Two CLEARs.
+fn erase(device: &mut Device) -> Result<(), String> {
     device.host(|host| {
         host.command(1, CLEAR)?;
         host.command(1, CLEAR)
-    })?;
+    })
+}
+
+/// Two CLEARs, a reset, and the new program without CLEAR.
+fn erase_and_install(device: &mut Device, tell: Tell<'_>) -> Result<(), String> {
+    erase(device)?;
     tell(allowed(&[STAY]));
     device.host(|host| good(1, NEW).iter().try_for_each(|block| host.block(1, block)))?;
-    tell(allowed(&[STAY, START_NEW]));
-    device.host(|host| host.command(1, SET_SIGNATURE))?;
-    tell(allowed(&[START_NEW]));
-    Ok(())
+    release(device, tell)
 }
 
 /// An update of program 1 in one transfer.
@@ -185,6 +192,19 @@ fn update_after_a_cut(device: &mut Device, _: &Allowed, tell: Tell<'_>) -> Resul
 // --- the stories
 // -----------------------------------------------------------------------------------------------------
 
+/// Of a device that has the old program, and gets the new one.
+const UPDATE: Scenario = Scenario {
+    name: "update",
+    about: "another program in the place of one that runs",
+    prepare: |device| install(device, 1, OLD, true),
+    act: |device, tell| {
+        tell(allowed(&[START_OLD]));
+        update(device, tell)
+    },
+    recover: update_after_a_cut,
+    end: || allowed(&[START_NEW]),
+};
+
 /// All of them.
 pub const SCENARIOS: &[Scenario] = &[
     Scenario {
@@ -194,51 +214,34 @@ pub const SCENARIOS: &[Scenario] = &[
         act: |device, tell| {
             tell(allowed(&[STAY]));
             download(device, 1, &good(1, NEW), || ())?;
-            tell(allowed(&[STAY, START_NEW]));
-            device.host(|host| host.command(1, SET_SIGNATURE))?;
-            tell(allowed(&[START_NEW]));
-            Ok(())
+            release(device, tell)
         },
-        recover: update_after_a_cut,
-        end: || allowed(&[START_NEW]),
+        ..UPDATE
     },
-    Scenario {
-        name: "update",
-        about: "another program in the place of one that runs",
-        prepare: |device| install(device, 1, OLD, true),
-        act: |device, tell| {
-            tell(allowed(&[START_OLD]));
-            update(device, tell)
-        },
-        recover: update_after_a_cut,
-        end: || allowed(&[START_NEW]),
-    },
+    UPDATE,
     Scenario {
         name: "raw",
         about: "another program as a raw image, which is valid without a signature command",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD]));
             update_at_once(device, raw(), tell)
         },
         recover: |device, _, tell| update_at_once(device, raw(), tell),
-        end: || allowed(&[START_NEW]),
+        ..UPDATE
     },
     Scenario {
         name: "hex",
         about: "another program as Intel HEX",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD]));
             update_at_once(device, hex(), tell)
         },
         recover: |device, _, tell| update_at_once(device, hex(), tell),
-        end: || allowed(&[START_NEW]),
+        ..UPDATE
     },
     Scenario {
         name: "wrong-crc",
         about: "an update whose last block tells another CRC, then the right one",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD]));
             let wrong = blocks(1, &image(1, NEW), PRODUCT_CODE, 0xDEAD_BEEF);
@@ -252,13 +255,11 @@ pub const SCENARIOS: &[Scenario] = &[
             }
             update(device, tell)
         },
-        recover: update_after_a_cut,
-        end: || allowed(&[START_NEW]),
+        ..UPDATE
     },
     Scenario {
         name: "wrong-product",
         about: "an update for another product, which costs nothing",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD]));
             let image = image(1, NEW);
@@ -268,34 +269,25 @@ pub const SCENARIOS: &[Scenario] = &[
                 Err(_) => Ok(()),
             }
         },
-        recover: update_after_a_cut,
         end: || allowed(&[START_OLD, START_NEW]),
+        ..UPDATE
     },
     Scenario {
         name: "erase",
         about: "a program taken away by two CLEARs",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD, STAY]));
-            device.host(|host| {
-                host.command(1, CLEAR)?;
-                host.command(1, CLEAR)
-            })?;
+            erase(device)?;
             tell(allowed(&[STAY]));
             Ok(())
         },
-        recover: |device, _, _| {
-            device.host(|host| {
-                host.command(1, CLEAR)?;
-                host.command(1, CLEAR)
-            })
-        },
+        recover: |device, _, _| erase(device),
         end: || allowed(&[STAY]),
+        ..UPDATE
     },
     Scenario {
         name: "erase-and-install",
         about: "a program taken away by two CLEARs, and after a reset another one without CLEAR, which looks whether the flash is blank",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD, STAY]));
             erase_and_install(device, tell)
@@ -304,7 +296,7 @@ pub const SCENARIOS: &[Scenario] = &[
             tell(from.clone());
             erase_and_install(device, tell)
         },
-        end: || allowed(&[START_NEW]),
+        ..UPDATE
     },
     Scenario {
         name: "sign",
@@ -322,7 +314,6 @@ pub const SCENARIOS: &[Scenario] = &[
     Scenario {
         name: "unsign",
         about: "a signature taken away",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[STAY, START_OLD]));
             device.host(|host| host.command(1, CLR_SIGNATURE))?;
@@ -331,11 +322,11 @@ pub const SCENARIOS: &[Scenario] = &[
         },
         recover: |device, _, _| device.host(|host| host.command(1, CLR_SIGNATURE)),
         end: || allowed(&[STAY]),
+        ..UPDATE
     },
     Scenario {
         name: "lss-store",
         about: "node-ID and bit rate stored by layer setting services",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(with_nodes(&[START_OLD], &[BOARD_NODE, node(9)]));
             device.host(|host| host.store_node(node(9)))?;
@@ -344,11 +335,11 @@ pub const SCENARIOS: &[Scenario] = &[
         },
         recover: |device, _, _| device.host(|host| host.store_node(node(9))),
         end: || with_nodes(&[START_OLD], &[node(9)]),
+        ..UPDATE
     },
     Scenario {
         name: "compaction",
         about: "so many stores of node-ID and bit rate that the journal changes over twice",
-        prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             let mut last = BOARD_NODE;
             for id in 1..=50 {
@@ -364,6 +355,7 @@ pub const SCENARIOS: &[Scenario] = &[
             device.host(|host| host.store_node(node(100)))
         },
         end: || with_nodes(&[START_OLD], &[node(50), node(100)]),
+        ..UPDATE
     },
     Scenario {
         name: "crash-count",
