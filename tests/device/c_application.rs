@@ -76,9 +76,7 @@ fn install(bench: &mut Bench, image: &str) -> Report {
 
 /// A board that runs the application, and the report of its installation.
 fn running_board() -> (Bench, Report) {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let report = install(&mut bench, firmware::APP_C_PROBE);
     bench.events();
     (bench, report)
@@ -146,9 +144,7 @@ fn size_of_arguments(selector: u32) -> u32 {
 #[test]
 fn it_is_a_node_like_any_other() {
     assert_eq!(crc32(b"123456789"), 0xCBF4_3926, "the check value of the CRC catalogue");
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let identity = [1, 2, 3, 4].map(|sub| Address::new(0x1018, sub));
     let of_bootloader = identity.map(|at| number(&mut bench, at));
     let report = install(&mut bench, firmware::APP_C_PROBE);
@@ -323,9 +319,8 @@ fn every_service_works_on_the_stack_alone() {
 /// The cycles, at 8 MHz and with the costs of the manuals, are those of docs/application.md.
 #[test]
 fn a_journal_that_is_nearly_full_refuses_what_can_wait_and_the_next_start_makes_room() {
-    let mut bench = Bench::with(machine::Options { costs: true, ..machine::Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench =
+        Bench::with(machine::Options { costs: true, ..machine::Options::default() }).switched_on();
     install(&mut bench, firmware::APP_C_PROBE);
     let plain_call = |bench: &mut Bench, selector, words: [u32; 2]| {
         let address = number(bench, probe::ADDRESS);
@@ -547,9 +542,7 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
 
 #[test]
 fn a_trial_confirms_itself_and_takes_it_back() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_C_PROBE), &options, &mut |_| {}).unwrap();
     let start_unsigned = |bench: &mut Bench| {
@@ -595,9 +588,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let refused = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap_err().to_string();
     assert!(refused.contains("0x08080000"), "{refused}");
 
-    let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(&image(firmware::BOOTLOADER)).switched_on();
     // A host that does not know the board asks the device, and sends nothing.
     let blocks = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &Options::default()).unwrap().program;
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();

@@ -4,7 +4,6 @@
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{dead_crystal, firmware};
-use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::Time;
@@ -67,11 +66,8 @@ fn without_its_crystal_a_device_only_listens_until_lss_speaks() {
 /// The rescue window of a device that cannot answer ends as if nobody had asked.
 #[test]
 fn a_request_that_is_not_heard_does_not_keep_a_device_from_its_program() {
-    let mut installed = Bench::new();
-    installed.power_on();
-    installed.await_boot_up(100);
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut installed.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    let mut installed = Bench::new().switched_on();
+    installed.install(firmware::APP_V1);
     let cells = installed.machine().flash().to_vec();
 
     let mut bench = failed(firmware::BOOTLOADER);

@@ -4,7 +4,6 @@
 
 use coboot_tests::bench::{Bench, BIT_RATE, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::bus::Outcome;
 use emulator::frame::Frame;
@@ -31,9 +30,7 @@ fn micros(span: Span) -> u64 {
 
 /// A board in its bootloader, without a program.
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     bench.run_ms(50);
     bench
 }
@@ -73,9 +70,7 @@ fn flood(bench: &mut Bench, port: PortId, frames: &[Frame], count: usize) {
 fn a_data_length_code_above_8_is_eight_bytes_to_bootloader_and_program() {
     let mut bench = board();
     bench.assert_takes_every_dlc();
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
-        .expect("installed");
+    bench.install(firmware::APP_V1);
     assert!(!bench.is_bootloader(NODE));
     bench.assert_takes_every_dlc();
 }

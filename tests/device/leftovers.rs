@@ -224,9 +224,7 @@ fn residues(bench: &mut Bench) -> Vec<String> {
 fn no_reset_leaves_a_patch_or_a_breakpoint() {
     let vector = |image: &[u8]| u32::from_le_bytes(image[4..8].try_into().unwrap()) & !1;
     for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_SEALED] {
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         let mut words = [0; 8];
         bench.machine().read_memory(firmware::board().bootloader.base, &mut words).unwrap();
         // After the first instructions, which no program can guard, Reset goes straight on for some time.
@@ -261,9 +259,7 @@ fn no_reset_leaves_a_patch_or_a_breakpoint() {
 #[test]
 fn an_open_device_leaves_a_probe_its_breakpoints() {
     for (image, stays) in [(firmware::BOOTLOADER, true), (firmware::BOOTLOADER_SEALED, false)] {
-        let mut bench = Bench::of_image(image);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = Bench::of_image(image).switched_on();
         assert!(bench.machine().attach_debugger());
         poke(&mut bench, &[(FP_COMP0, 0xC802_0001), (FP_CTRL, 3)]);
         bench.machine().resume(false);
@@ -298,9 +294,7 @@ fn scripted_program(wrong: &Wrong) -> Program {
 /// A bootloader that has this program, with the silicon of caches that become stale.
 fn board_with(wrong: &Wrong) -> Bench {
     let silicon = Silicon { stale_lines: true, ..TYPICAL };
-    let mut bench = Bench::with(machine::Options { silicon, ..machine::Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::with(machine::Options { silicon, ..machine::Options::default() }).switched_on();
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &scripted_program(wrong), &options, &mut |_| {}).unwrap();
     bench.run_ms(100);
@@ -380,8 +374,7 @@ fn plays_the_main_job_after(wrong: &Wrong, register: u32, bits: u32) {
     bench.await_boot_up(1_000);
     bench.run_ms(500);
     let left_on = bench.machine().register(register).unwrap() & bits;
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    bench.install(firmware::APP_V1);
     assert!(!bench.is_bootloader(NODE));
     bench.power_off();
     bench.run_ms(10);

@@ -20,7 +20,7 @@ const LSS_RESPONSE: u32 = 0x7E4;
 
 /// A board in its bootloader, without a program.
 fn empty_board() -> Bench {
-    let mut bench = Bench::complete().switched_on();
+    let mut bench = Bench::new().switched_on();
     // The emergency after the boot-up message.
     bench.run_ms(5);
     bench

@@ -3,7 +3,6 @@
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::silicon::{play, play_on, SCENARIOS};
-use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::{Operation, Options};
 use emulator::silicon::{Choice, Silicon, TYPICAL};
@@ -132,8 +131,7 @@ const DATA_CACHE: u32 = 1 << 10;
 fn board_with_the_data_cache_on() -> Bench {
     let mut bench = board(Silicon { stale_lines: true, ..TYPICAL }, CRYSTAL);
     bench.await_boot_up(200);
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     assert_ne!(bench.machine().register(FLASH_ACR).unwrap() & DATA_CACHE, 0);
     bench

@@ -53,9 +53,7 @@ fn an_update_on_a_line_that_falls_breaks_off_and_works_later() {
     // Before the erase, in it, between blocks of data.
     for (after_ms, silicon) in [(5, TYPICAL), (800, WORST), (2_500, WORST)] {
         let what = format!("after {after_ms} ms, {silicon}");
-        let mut bench = board(silicon);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = board(silicon).switched_on();
         assert!(update(&mut bench, firmware::APP_V1), "{what}");
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1_000);
@@ -75,9 +73,7 @@ fn an_update_on_a_line_that_falls_breaks_off_and_works_later() {
 fn a_program_on_a_dominant_line_can_be_called_back_later() {
     for from_power_on in [false, true] {
         let what = format!("from power-on: {from_power_on}");
-        let mut bench = board(TYPICAL);
-        bench.power_on();
-        bench.await_boot_up(100);
+        let mut bench = board(TYPICAL).switched_on();
         assert!(update(&mut bench, firmware::APP_V1), "{what}");
         bench.confirm_program();
         if from_power_on {

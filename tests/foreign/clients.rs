@@ -14,9 +14,7 @@ use coflash_core::file::block_file::emit;
 const VERSION: Address = Address::new(0x100A, 0);
 
 fn endpoint() -> Endpoint {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let bench = Bench::new().switched_on();
     Endpoint::new(bench)
 }
 

@@ -38,10 +38,7 @@ fn is_board_of_examples() -> bool {
 
 /// A board with only the bootloader.
 fn empty_board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    Bench::new().switched_on()
 }
 
 fn coflash() -> Command {

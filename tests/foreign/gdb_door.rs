@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::gdb::Door;
 use emulator::pacing::{Pacer, Speed};
 use emulator::socketcand::Server;
@@ -72,8 +71,7 @@ fn ended(child: &mut Child) -> bool {
 #[test]
 fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     let mut bench = Bench::new().switched_on();
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     let mut desk = Desk::new(bench);
 

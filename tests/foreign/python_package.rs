@@ -99,9 +99,7 @@ for file in files:
 /// A sealed device accepts the valid file and refuses another one with its number in 1F57h.
 #[test]
 fn a_sealed_device_is_updated_from_python() {
-    let mut bench = sealed_board::board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let bench = sealed_board::board().switched_on();
     let mut endpoint = Endpoint::new(bench);
     let image = firmware::raw(firmware::APP_V1);
     let genuine = sealed_board::sealer(sealed_board::COUNTER).seal(&image, &sealed_board::release()).unwrap();

@@ -89,20 +89,13 @@ fn an_update_and_the_way_back_through_can2() {
     if !is_its_chip() {
         return;
     }
-    let mut bench = bench_at(2);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = bench_at(2).switched_on();
     assert!(bench.is_bootloader(1));
     // Tasks of priority 2 and 3 out of 16, in the upper four bits, where 0 is the highest.
     assert_set_up(&mut bench, [0xE0, 0xD0]);
 
-    let report = flash(
-        &mut bench.session(),
-        &blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    let options = FlashOptions::default().trial_run(false);
+    let report = flash(&mut bench.session(), &blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "1.0.0");
     assert!(!bench.is_bootloader(1));
     let identification = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
@@ -120,13 +113,7 @@ fn an_update_and_the_way_back_through_can2() {
     assert_eq!(version(&mut bench), "1.0.0");
 
     // The next version, from the running application; it starts by itself.
-    flash(
-        &mut bench.session(),
-        &blocks(firmware::APP_V2),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    flash(&mut bench.session(), &blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "2.0.0");
     bench.power_off();
     bench.run_ms(500);
@@ -160,9 +147,7 @@ fn the_filters_of_can1_stay() {
     if !is_its_chip() {
         return;
     }
-    let mut bench = bench_at(2);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = bench_at(2).switched_on();
     // Banks 0 and 13, CAN1's first and last: one filter of 32 bits each for FIFO 1, and bank 13
     // active.
     let kept = [(0x20C, 1 | 1 << 13), (0x214, 1 | 1 << 13), (0x21C, 1 << 13), (0x240, 7), (0x2AC, 8)];

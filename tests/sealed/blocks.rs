@@ -75,9 +75,7 @@ fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
 
 /// A sealed board in its bootloader, with version 1 from a download in one transfer.
 fn board_with_a_program() -> Bench {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     let file = seal(&sealer(COUNTER), firmware::APP_V1);
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     assert_runs(&mut bench, "1.0.0", "version 1");

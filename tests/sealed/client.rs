@@ -20,10 +20,7 @@ const VERSION: Address = Address::new(0x100A, 0);
 const SLOWER: u32 = 4;
 
 fn started() -> Bench {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    board().switched_on()
 }
 
 /// By either transfer; an image with a flipped bit is refused. The time-out is long, because it

@@ -17,9 +17,7 @@ const REFUSED: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
 
 /// A sealed board with a sealed program that was downloaded in one transfer and started.
 fn fresh_board(image: &str) -> Bench {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     let file = sealer(COUNTER).seal(&firmware::raw(image), &release()).unwrap();
     assert_eq!(write(&mut bench, &file, Transfers::Segments), (None, 0), "{image}");
     bench.session().command(1, ProgramControl::Start).unwrap();

@@ -62,9 +62,7 @@ fn call_back(bench: &mut Bench) {
 
 /// A sealed device in its bootloader, with version 1 installed, started once and confirmed.
 fn board_with_a_program() -> Bench {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     let file = seal(&sealer(COUNTER), firmware::APP_V1);
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     start(&mut bench, firmware::APP_V1, "1.0.0");
@@ -79,9 +77,7 @@ fn the_date_of_a_sealed_program_is_that_of_its_manifest() {
     fn date(bench: &mut Bench) -> [u32; 2] {
         [1, 2].map(|sub| bench.session().read_number(Address::new(0x1F52, sub)).unwrap())
     }
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     for (counter, created, expected) in
         [(COUNTER, 951_825_600, [5903, 43_200_000]), (COUNTER + 1, 1_795_804_215, [15_671, 66_615_000])]
     {
@@ -112,9 +108,7 @@ fn assert_old_program_starts(bench: &mut Bench, what: &str) {
 /// previous one.
 #[test]
 fn sealed_programs_are_taken_and_started() {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     let versions = [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")];
     for transfers in [Transfers::Segments, Transfers::Blocks] {
         for ((what, sealer), (image, version)) in kinds(COUNTER)
@@ -136,17 +130,13 @@ fn sealed_programs_are_taken_and_started() {
 fn a_sealed_device_can_be_looked_into_during_development() {
     let file = seal(&sealer(COUNTER), firmware::APP_V1);
     let mut listener = Listener::probe();
-    let mut bench = board_of(firmware::BOOTLOADER_SEALED_LOG_RTT);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board_of(firmware::BOOTLOADER_SEALED_LOG_RTT).switched_on();
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     let lines = listener.told(&mut bench);
     assert!(lines.iter().any(|line| line == "1F51h; program and command 00000103"), "{lines:?}");
     start(&mut bench, firmware::APP_V1, "1.0.0");
 
-    let mut bench = board_of(firmware::BOOTLOADER_SEALED_DEBUGGER);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board_of(firmware::BOOTLOADER_SEALED_DEBUGGER).switched_on();
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     let place = firmware::board().key_block().base;
     let read = Debugger::new(&mut bench.session()).read(place, 256, &mut |_| {}).unwrap();
@@ -225,9 +215,7 @@ fn the_counter_goes_up_and_never_back() {
 /// it has no root.
 #[test]
 fn without_keys_the_device_is_open() {
-    let mut bench = open_board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = open_board().switched_on();
     let sealed = seal(&sealer(COUNTER), firmware::APP_V1);
     assert_eq!(write(&mut bench, &sealed, Transfers::Blocks).1, status::KEY);
     assert_eq!(write(&mut bench, &firmware::raw(firmware::APP_V1), Transfers::Segments), (None, status::OK));

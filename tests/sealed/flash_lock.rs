@@ -204,9 +204,7 @@ fn a_sealed_program_that_writes_flash_is_not_locked_out() {
     assert_eq!((log.faults, log.locks), (0, [0, 0x0FFF_AAEC]));
     assert_eq!(log.callgate, 0);
     // Where the bootloader can be renewed, it could write a bootloader that nobody has verified.
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = board().switched_on();
     assert_eq!(write(&mut bench, &file, Transfers::Blocks).1, status::WRONG_PRODUCT);
 }
 

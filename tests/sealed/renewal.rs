@@ -59,10 +59,7 @@ fn sealed(counter: u32, version: u32) -> Vec<u8> {
 
 /// A sealed device without a program, in its bootloader.
 fn device() -> Bench {
-    let mut bench = board();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
+    board().switched_on()
 }
 
 /// Downloads a file; the word of 1F57h.

@@ -83,12 +83,6 @@ impl Bench {
         Self::of(firmware::BOOTLOADER, vec![options])
     }
 
-    /// A board with a bootloader with every option.
-    #[must_use]
-    pub fn complete() -> Self {
-        Self::of(firmware::BOOTLOADER, vec![Options::default()])
-    }
-
     /// A board with this bootloader.
     #[must_use]
     pub fn of_image(bootloader: &str) -> Self {

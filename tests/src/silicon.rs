@@ -61,11 +61,6 @@ pub fn play_on(scenario: &Scenario, silicon: Silicon, seed: u64) {
     bench.assert_nothing_unmodelled();
 }
 
-fn install(bench: &mut Bench, image: &str) {
-    let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
-}
-
 fn power_cycle(bench: &mut Bench) {
     bench.power_cycle();
     bench.await_program(1000);
@@ -91,7 +86,7 @@ fn main_job(bench: &mut Bench, way: u8) {
 /// A program that was never confirmed loses its power before it could prove anything, once or twice, and
 /// then works.
 fn trial_dies(bench: &mut Bench, random: &mut Random) {
-    install(bench, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     for _ in 0..=random.below(2) {
         bench.run_ms(random.below(400) as u64);
         power_cycle(bench);
@@ -108,10 +103,10 @@ fn trial_dies(bench: &mut Bench, random: &mut Random) {
 
 /// A program that has started the watchdog and feeds it no more.
 fn program_hangs(bench: &mut Bench) {
-    install(bench, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     crashes_until_given_up(bench);
-    install(bench, firmware::APP_V2);
+    bench.install(firmware::APP_V2);
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
 }
 
@@ -141,7 +136,7 @@ fn bootloader_hangs(bench: &mut Bench) {
     let periods = (at - from).0 / 1_000_000 * u64::from(lsi_hz) / 1_000_000;
     assert!((28_000..=33_000).contains(&periods), "after {periods} periods of the LSI");
     assert!(bench.is_bootloader(NODE));
-    install(bench, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
 }
 
 /// A cut of the power somewhere in the next `operations` of the flash, or after them.
@@ -186,7 +181,7 @@ fn store_with_a_cut(bench: &mut Bench, random: &mut Random) {
 
 /// After a cut in an update the device can be reached, and the update works.
 fn update_with_a_cut(bench: &mut Bench, random: &mut Random) {
-    install(bench, firmware::APP_V1);
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     cut_somewhere(bench, random, UPDATE_OPERATIONS);
     let options = FlashOptions::default().trial_run(false);
@@ -195,7 +190,7 @@ fn update_with_a_cut(bench: &mut Bench, random: &mut Random) {
     power_returns(bench);
     bench.await_program(1000);
     bench.run_ms(50);
-    install(bench, firmware::APP_V2);
+    bench.install(firmware::APP_V2);
     bench.run_ms(500);
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
     assert!(bench.time() < emulator::time::Time(0) + Span::from_millis(600_000), "it took minutes");

@@ -22,9 +22,7 @@ const NEW: u32 = 0x0009_0001;
 
 /// A board that runs version 1 of the application.
 fn board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     install(&mut bench, firmware::APP_V1);
     bench
 }
@@ -142,9 +140,7 @@ fn an_interrupted_renewal_goes_on_when_it_is_started_again() {
 /// A program in the way is named, and so is what to do about it.
 #[test]
 fn a_program_that_reaches_into_staging_is_named() {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let staging = firmware::board().staging.unwrap();
     let large =
         firmware::made_up((staging.base - firmware::board().programs[0].base) as usize + 64, |at| at as u8);
@@ -182,9 +178,7 @@ fn a_bootloader_for_another_resident_part_is_refused_and_named() {
 /// A sealed device takes a sealed one alone.
 #[test]
 fn an_unsigned_bootloader_is_refused_before_the_call() {
-    let mut bench = sealed_board::board();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = sealed_board::board().switched_on();
     bench.machine().keep_flash_log();
     let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
     assert!(matches!(result, Err(Error::SealedOnly { .. })), "{result:?}");
@@ -194,9 +188,7 @@ fn an_unsigned_bootloader_is_refused_before_the_call() {
 
 #[test]
 fn a_bootloader_without_renewal_says_so() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST).switched_on();
     let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
     assert!(matches!(result, Err(Error::NotRenewable { .. })), "{result:?}");
 }

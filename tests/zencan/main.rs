@@ -131,9 +131,7 @@ fn refused<T>(index: u16, sub: u8, code: AbortCode) -> Result<T, SdoClientError>
 
 #[test]
 fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_program() {
-    let mut bench = Bench::complete();
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::new().switched_on();
     let file = firmware::blocks(firmware::APP_V1);
     let blocks: Vec<Vec<u8>> = BlockFile::of(&file).blocks().iter().map(|block| block.emit()).collect();
     assert!(blocks.len() >= 3);

@@ -11,7 +11,7 @@ use crate::tool::{coflash, folder, Done};
 use coflash_core::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash_core::file::{ihex, raw};
 use kit::fake::vault::Vault;
-use kit::fake::{serve, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
+use kit::fake::{serve, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
 use kit::folder::Folder;
 use kit::ihex::{intel_hex, END_OF_FILE};
 use serde_json::Value;

@@ -12,7 +12,7 @@ use coflash_core::device::{Session, Timing, Transfers};
 use coflash_core::Error;
 use embedded_can::Frame as _;
 
-use kit::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
+use kit::fake::{Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
 
 const NAME: Address = Address::new(0x1008, 0);
 const TYPE: Address = Address::new(0x1000, 0);

@@ -17,7 +17,7 @@ use coflash_core::Error;
 use embedded_can::Frame as _;
 
 use super::packed;
-use kit::fake::{Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+use kit::fake::{Bus, Fake, Maker, APPLICATION, BOOTLOADER};
 
 /// The CRC in the last block of `plain-400.blk`, as expected.py computed it (bytes 875 to 878).
 const CRC: u32 = 0x4CF3_C5A5;

@@ -14,7 +14,7 @@ use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 
-use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
     let file = block_file::read(data!("plain-400.blk")).unwrap();
