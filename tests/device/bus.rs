@@ -108,9 +108,7 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
         }
     }
     let off = bench.time();
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
+    bench.power_cycle();
     // None of the programs was confirmed.
     bench.run_ms(RESCUE_WINDOW_MS + 200);
     for (node, serial) in [2, 3, 4].into_iter().zip(serials) {

@@ -14,8 +14,6 @@ use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::OnceLock;
 use std::task::Poll;
 
-use boot_core::bootloader::PasswordObject;
-use boot_core::canopen::od::Address;
 use boot_core::canopen::{BitRate, Instant, NodeId};
 use boot_core::flash::FlashFault;
 use coboot_tests::sealed::{
@@ -305,12 +303,7 @@ impl Attack<'_> {
     }
 
     fn password(&mut self, host: &mut Host<'_>, program: u8) {
-        let password = self.setup.profile.password;
-        let at = match self.setup.profile.extras.password {
-            PasswordObject::None => return,
-            PasswordObject::EnableFlash => Address::new(0x7F50, program),
-            PasswordObject::Unlock => Address::new(0x6005, 1),
-        };
+        let Some((at, password)) = self.setup.password(program) else { return };
         let answer = host.node.write(at, password);
         self.tell(format!("password for {program}: {answer:?}"));
     }

@@ -3,7 +3,7 @@
 
 use std::sync::OnceLock;
 
-use boot_core::bootloader::{Everything, PasswordObject};
+use boot_core::bootloader::Everything;
 use boot_core::canopen::od::Address;
 use boot_core::canopen::{AbortCode, Instant};
 use boot_core::control::SealedMemory;
@@ -423,15 +423,9 @@ impl Host<'_> {
 
     /// Password or CLEAR: a download may begin.
     pub fn clear(&mut self, program: u8) {
-        let password = self.device.setup.profile.password;
-        match self.device.setup.profile.extras.password {
-            PasswordObject::None => drop(self.commanded(program, CLEAR)),
-            PasswordObject::EnableFlash => {
-                self.node.write(Address::new(0x7F50, program), password).expect("it is right");
-            }
-            PasswordObject::Unlock => {
-                self.node.write(Address::new(0x6005, 1), password).expect("it is right");
-            }
+        match self.device.setup.password(program) {
+            None => drop(self.commanded(program, CLEAR)),
+            Some((at, password)) => self.node.write(at, password).expect("it is right"),
         }
         self.settle();
     }

@@ -33,9 +33,7 @@ fn zephyrs_runner_updates_and_confirms_a_running_device() {
         assert!(stop <= Duration::from_millis(25), "{image}: {stop:?}");
         bench.run_ms(100);
         assert!(!bench.is_bootloader(NODE), "{image}: it was confirmed, not called back");
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE), "{image}: it starts by itself, without a rescue window");
         bench.assert_nothing_unmodelled();

@@ -127,9 +127,7 @@ fn an_interrupted_renewal_goes_on_when_it_is_started_again() {
         bench.machine().cut_power_at(Some(FlashCut { operation, when: Cut::Torn { seed: 7 } }));
         assert!(renewed(&mut bench, &new).0.is_err());
         bench.machine().cut_power_at(None);
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_program(1000);
         renewed(&mut bench, &new).0.unwrap();
         call_back(&mut bench);

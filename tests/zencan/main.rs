@@ -238,9 +238,7 @@ fn as_lss_master_it_finds_three_devices_by_fastscan_and_gives_each_a_node_id() {
             assert_eq!(node.device_name.as_deref(), Some(bsp::IDENTITY.device_name));
             assert_eq!(node.nmt_state, Some(NmtState::PreOperational));
         }
-        bench.power_off();
-        bench.run_ms(100);
-        bench.power_on();
+        bench.power_cycle();
     }
     bench.assert_nothing_unmodelled();
 }
