@@ -23,6 +23,7 @@ use kit::rig::{Setup, BOARD_NODE, ESACADEMY_2, LIFT_2, STANDARD_2};
 
 const PROGRAMS: usize = 2;
 
+/// With the identity that the labels of the kept inputs have.
 fn configs() -> &'static [Config; 3] {
     static CONFIGS: OnceLock<[Config; 3]> = OnceLock::new();
     let of = |Setup { config, .. }: &Setup| {
