@@ -52,8 +52,15 @@ impl Stream {
         self.size = size;
     }
 
-    /// Sets the address of the next bytes: a gap begins a new piece.
+    /// Sets the address of the next bytes: a gap begins a new piece, but for one before the label.
     pub(super) fn seek(&mut self, address: u32, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        // A linker may leave a gap before the label, which is judged with the vectors.
+        let base = to.judge.region.base;
+        if self.next != base && address <= base + label::OFFSET {
+            while self.next < address && to.queue.push(self.next, &[0xFF]) {
+                self.next += 1;
+            }
+        }
         if address != self.next {
             self.close(to)?;
             self.next = address;
@@ -113,7 +120,9 @@ impl Stream {
 /// vectors and label are checked again when everything is in flash.
 pub(super) fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
     if to.queue.open_address() != to.judge.region.base {
-        return Ok(());
+        // An installed program is given up for the start of another one alone.
+        let is_kept = to.judge.installed && !to.judge.has_begun();
+        return if is_kept { Err(Refusal::unfit(FlashError::Address)) } else { Ok(()) };
     }
     // It may have changed since the download began, and so far nothing is lost.
     to.judge.is_allowed()?;
@@ -122,7 +131,8 @@ pub(super) fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
         return Ok(());
     }
     let mut vectors = [0; 8];
-    if to.queue.read_open(0, &mut vectors) {
+    // An installed program is not lost for fewer bytes: the zeros are no vectors.
+    if to.queue.read_open(0, &mut vectors) || to.judge.installed {
         let [a, b, c, d, e, f, g, h] = vectors;
         to.judge.check_vectors([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))?;
     }

@@ -12,12 +12,15 @@ use kit::ihex::{record, END_OF_FILE as EOF};
 use kit::model::{ModelFlash, CHIP};
 use proptest::prelude::*;
 use shared_abi::boot_report::BootReport;
+use shared_abi::label::Label;
 use shared_abi::warm_start::{BootRequest, Owed};
 
 const STORE: AbortCode = AbortCode(0x0800_0020);
 const STATE: AbortCode = AbortCode(0x0800_0022);
 const TOO_LONG: AbortCode = AbortCode(0x0607_0012);
 const RESET_STAT: u8 = 0x02;
+/// Vendor-ID and product code.
+const IDENTITY: (u32, u32) = (0x0102_0304, 0x0A0B_0C0D);
 
 /// A program as HEX in records of `len` bytes, from its base.
 fn hex(program: &[u8], len: usize, end: &str) -> String {
@@ -218,7 +221,18 @@ fn what_is_seen_in_time_erases_nothing() {
             record(address as u16, 0, data)
         )
     };
+    // As objcopy writes a program, whose label comes after the gap behind its vectors.
+    let mut other = image.clone();
+    other[0x1E0..0x200].copy_from_slice(&Label::new(IDENTITY.0, IDENTITY.1 ^ 1, 7).emit());
+    let without = |text: &str, gap: core::ops::Range<usize>| {
+        let lines = text.lines().enumerate().filter(|(at, _)| !gap.contains(at));
+        lines.map(|(_, line)| format!("{line}\n")).collect::<String>()
+    };
     let cases: Vec<Case<'_>> = vec![
+        ("another product, HEX", without(&hex(&other, 8, "\n"), 0x32..0x3D).into(), None, STORE, 0x82),
+        ("no reset vector, HEX", without(&hex(&image, 4, "\n"), 2..3).into(), None, STORE, 0x04),
+        ("one word, HEX", without(&hex(&image, 4, "\n"), 2..0x90).into(), None, STORE, 0x04),
+        ("linked for another place, HEX", without(&text, 1..0x11).into(), None, STORE, 0x0C),
         ("no format", b"<xml>firmware</xml>".to_vec(), None, STORE, 0x04),
         (
             "a stack outside RAM",
@@ -247,7 +261,8 @@ fn what_is_seen_in_time_erases_nothing() {
     for (what, data, size, abort, status) in cases {
         let mut flash = ModelFlash::new(&CHIP);
         // Large enough for a first piece of 1 KiB.
-        let mut bench = Bench::with_buffer(&mut flash, Policy::DEFAULT, 8192);
+        let policy = Policy { identity: Some(IDENTITY), ..Policy::DEFAULT };
+        let mut bench = Bench::with_buffer(&mut flash, policy, 8192);
         bench.install(&old);
         assert_eq!(bench.command(SET_SIGNATURE), 0);
         assert_eq!(bench.command(CLEAR), 0);
