@@ -135,6 +135,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         };
         if matches!(command, Stop | StartBootloader) {
             // It runs, and it is the bootloader.
+            state.stopped |= command == Stop;
             return Ok(());
         }
         let own = self.programmer.program() == Some(BOOTLOADER);

@@ -287,6 +287,13 @@ fn every_format_is_taken() {
         let mut board = Board::new(&old);
         let mut node = board.start();
         let bytes = if form == "raw" { new.clone() } else { ihex::intel_hex(HOME.base, &new).into_bytes() };
+        // As for a program: what has broken off begins anew after STOP.
+        let at = Address::new(0x1F50, N);
+        node.0.download_start(at, None).unwrap();
+        go_on(&mut node.0, N, &bytes[..0x300], 7).unwrap();
+        node.0.download_cancel(at);
+        assert_eq!(node.send(N, &bytes), Err(AbortCode::DEVICE_STATE), "{form}");
+        node.command(N, 0);
         node.send(N, &bytes).unwrap();
         assert_eq!((node.word(0x1F57), node.progress().state), (0, State::Staged), "{form}");
         assert!(node.has_staged(&new), "{form}");
