@@ -329,7 +329,9 @@ impl ProgramControl {
                 let request = match (self.promised, command) {
                     (Some(before @ BootRequest::Owed(_)), _) => before,
                     // The answer comes from here, so the bootloader owes none to a node; it counts STOP.
-                    (None, Command::Stop) => BootRequest::Owed(Owed { program: sub, value, node_id: 0 }),
+                    (None | Some(BootRequest::Stay), Command::Stop) => {
+                        BootRequest::Owed(Owed { program: sub, value, node_id: 0 })
+                    }
                     _ => BootRequest::Stay,
                 };
                 self.promise(request, now)?;
@@ -450,7 +452,11 @@ impl ProgramControl {
 
     /// The device leaves with this request, unless it was promised to leave with another one.
     fn promise(&mut self, request: BootRequest, now: u32) -> Result<(), Abort> {
-        if self.promised.is_some_and(|promised| promised != request) {
+        // An answered STOP leads into the bootloader, too.
+        let keeps = |promised| {
+            promised == request || promised == BootRequest::Stay && matches!(request, BootRequest::Owed(_))
+        };
+        if !self.promised.is_none_or(keeps) {
             return Err(Abort::DEVICE_STATE);
         }
         self.promised = Some(request);
@@ -657,8 +663,10 @@ mod tests {
         stored.node_stored(Some(32), false);
         for mut control in [changed.clone(), stored, control(false).answering_itself()] {
             assert_eq!(control.write(1, &[3], 0, &mut { STORES }), Err(STATE));
-            assert_eq!(control.write(1, &[0], 0, &mut { STORES }), Ok(Answer::Send));
-            assert_eq!(control.write(1, &[0x80], 0, &mut { STORES }), Ok(Answer::Send), "it leaves");
+            // Before it or after it, 80h makes no difference to the STOP.
+            for value in [0x80, 0, 0x80] {
+                assert_eq!(control.write(1, &[value], 0, &mut { STORES }), Ok(Answer::Send), "it leaves");
+            }
             assert_eq!(request_behind(&mut control), Next::Leave(stopped));
         }
         // Stored, the new node-ID is the bootloader's as well.
