@@ -336,7 +336,9 @@ impl ProgramControl {
                 };
                 self.promise(request, now)?;
             }
-            _ if matches!(self.promised, Some(BootRequest::Confirm(_))) => return Err(Abort::DEVICE_STATE),
+            _ if matches!(self.promised, Some(BootRequest::Confirm(_) | BootRequest::StoreNode(_))) => {
+                return Err(Abort::DEVICE_STATE)
+            }
             Reaction::Restart => self.leave(BootRequest::Start(sub), now),
             Reaction::HandOver => {
                 let node_id = answers.unwrap_or(0);
@@ -709,6 +711,14 @@ mod tests {
         }
         control.nmt_reset(3);
         assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Confirm(1)));
+        // Nor the node-ID that the application was told to be stored.
+        let stored = BootRequest::StoreNode(StoredNode::new(5, 125_000));
+        let mut stores = self::control(false);
+        assert_eq!(stores.promise(stored, 0), Ok(()));
+        for value in [0, 2, 3, 0x80] {
+            assert_eq!(stores.write(1, &[value], 2, &mut { LOCKS }), Err(STATE), "{value}");
+        }
+        assert_eq!(request_behind(&mut stores), Next::Leave(stored));
     }
 
     /// Nothing has happened after a no, and nothing is owed, however often a master asks; an NMT

@@ -66,26 +66,27 @@ int main(int count, char **words)
 
 /// Requests of the warm-start cell by their numbers: stay, start, power-on, an answer that is owed
 /// (for node 5), a STOP that was answered, confirm, store node, rescue.
-const REQUESTS: [u32; 8] = [STAY, 3, 5, OWED, STOPPED, CONFIRM, 12, 16];
+const REQUESTS: [u32; 8] = [STAY, 3, 5, OWED, STOPPED, CONFIRM, STORE_NODE, 16];
 const STAY: u32 = 1;
 const OWED: u32 = 5 << 8 | STOPPED;
 const STOPPED: u32 = 7;
 const CONFIRM: u32 = 10;
+const STORE_NODE: u32 = 12;
 
 /// What an application on `Departure` does: the rules that are outside of it are those of
 /// `app-template/src/objects.rs`.
 #[derive(Default)]
 struct Model {
     departure: Option<Departure<u32>>,
-    /// What it leaves with, as far as is known.
-    confirms: bool,
+    /// It leaves with this, since the bootloader is to store a value.
+    stores: Option<u32>,
     silent: bool,
     stopped: bool,
 }
 
 impl Model {
     fn begin(&mut self, request: u32, now: u32) -> bool {
-        if self.silent || self.confirms && request != CONFIRM {
+        if self.silent || self.stores.is_some_and(|kept| kept != request) {
             return false;
         }
         let departure = self.departure.get_or_insert_default();
@@ -97,7 +98,7 @@ impl Model {
             departure.begin(request, !matches!(request, 3 | 5 | 16), now);
             self.stopped = request == STOPPED || self.stopped && matches!(request, 3 | 5 | 16);
         }
-        self.confirms |= request == CONFIRM;
+        self.stores = Some(request).filter(|request| [CONFIRM, STORE_NODE].contains(request));
         true
     }
 

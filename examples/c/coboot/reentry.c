@@ -30,9 +30,10 @@ static bool is_promise(uint32_t request)
 bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint32_t argument, uint32_t now_ms)
 {
     const bool first = reentry->phase == COBOOT_STAYS;
+    /* The bootloader is to store a value. */
+    const bool stores = reentry->request == COBOOT_REQUEST_CONFIRM || reentry->request == COBOOT_REQUEST_STORE_NODE;
 
-    if (reentry->silent
-        || (!first && reentry->request == COBOOT_REQUEST_CONFIRM && request != COBOOT_REQUEST_CONFIRM)) {
+    if (reentry->silent || (!first && stores && request != reentry->request)) {
         return false;
     }
     /* An answered STOP leads into the bootloader, too, which has to count it. */
