@@ -73,20 +73,26 @@ const STOPPED: u32 = 7;
 const CONFIRM: u32 = 10;
 const STORE_NODE: u32 = 12;
 
+fn stores(request: u32) -> bool {
+    matches!(request, CONFIRM | STORE_NODE)
+}
+
 /// What an application on `Departure` does: the rules that are outside of it are those of
 /// `app-template/src/objects.rs`.
 #[derive(Default)]
 struct Model {
     departure: Option<Departure<u32>>,
-    /// It leaves with this, since the bootloader is to store a value.
-    stores: Option<u32>,
+    /// The last request on which somebody relies.
+    promised: Option<u32>,
     silent: bool,
     stopped: bool,
 }
 
 impl Model {
     fn begin(&mut self, request: u32, now: u32) -> bool {
-        if self.silent || self.stores.is_some_and(|kept| kept != request) {
+        // A value to store and another promise exclude each other (`ProgramControl`).
+        let excludes = |before| before != request && (stores(before) || stores(request));
+        if self.silent || self.promised.is_some_and(excludes) {
             return false;
         }
         let departure = self.departure.get_or_insert_default();
@@ -98,7 +104,9 @@ impl Model {
             departure.begin(request, !matches!(request, 3 | 5 | 16), now);
             self.stopped = request == STOPPED || self.stopped && matches!(request, 3 | 5 | 16);
         }
-        self.stores = Some(request).filter(|request| [CONFIRM, STORE_NODE].contains(request));
+        if !matches!(request, 3 | 5 | 16) {
+            self.promised = Some(request);
+        }
         true
     }
 

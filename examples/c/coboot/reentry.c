@@ -27,13 +27,19 @@ static bool is_promise(uint32_t request)
     return request != COBOOT_REQUEST_START && request != COBOOT_REQUEST_POWER_ON && request != COBOOT_REQUEST_RESCUE;
 }
 
+/* Whether the bootloader is to store a value. */
+static bool stores(uint32_t request)
+{
+    return request == COBOOT_REQUEST_CONFIRM || request == COBOOT_REQUEST_STORE_NODE;
+}
+
 bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint32_t argument, uint32_t now_ms)
 {
     const bool first = reentry->phase == COBOOT_STAYS;
-    /* The bootloader is to store a value. */
-    const bool stores = reentry->request == COBOOT_REQUEST_CONFIRM || reentry->request == COBOOT_REQUEST_STORE_NODE;
+    /* A value to store and another promise exclude each other: each is all that the bootloader gets. */
+    const bool differs = !first && is_promise(reentry->request) && request != reentry->request;
 
-    if (reentry->silent || (!first && stores && request != reentry->request)) {
+    if (reentry->silent || (differs && (stores(reentry->request) || stores(request)))) {
         return false;
     }
     /* An answered STOP leads into the bootloader, too, which has to count it. */
