@@ -121,7 +121,7 @@ pub struct Product {
     pub lss_store: bool,
     /// Whether programs can be written by SDO block download. Without it the device answers 05040001h, and
     /// a master goes on in segments, which takes two to three times as long (`SDO_BLOCKTRANSFER`). On boards with the
-    /// compact map Paulus' dialect has none.
+    /// compact map the dialects of Paulus and ESAcademy have none.
     pub block_download: bool,
     /// The segments of a sub-block of a block download at most, 1 to 127; at low bit rates the device takes
     /// fewer (`SDO_BLOCKSIZE_DOWNLOAD`).
@@ -259,15 +259,15 @@ impl Product {
     };
 
     /// A product whose only choice is its dialect. On the compact map a dialect has what its manual has:
-    /// ESAcademy's has Intel HEX, Paulus' has no SDO block transfer; ESAcademy's nodes and lifts have a node-ID of
-    /// their own, and no LSS.
+    /// ESAcademy's has Intel HEX, it and Paulus' have no SDO block transfer; ESAcademy's nodes and lifts have a node-ID
+    /// of their own, and no LSS.
     pub const fn of(profile: Profile) -> Self {
         let lss = LAYOUT.home.is_some() || !profile.download.locked;
         Self {
             lss,
             // A silent device waits for LSS.
             crystal_failure: if lss { CrystalFailure::Silent } else { CrystalFailure::RunFromHsi },
-            block_download: LAYOUT.home.is_some() || !is_paulus(&profile),
+            block_download: LAYOUT.home.is_some() || has_block_transfer(&profile),
             intel_hex: LAYOUT.home.is_some() || sends_hex(&profile),
             profile,
             ..Self::DEFAULT
@@ -306,8 +306,9 @@ impl Product {
             "product: CrcKind::Crc16 needs the split map: the compact one has no room for it"
         );
         assert!(
-            LAYOUT.home.is_some() || !self.block_download || !is_paulus(&self.profile),
-            "product: block_download needs the split map in Paulus' profile; Product::of(profile) has what fits"
+            LAYOUT.home.is_some() || !self.block_download || has_block_transfer(&self.profile),
+            "product: block_download needs the split map in the profiles PAULUS and ESACADEMY; Product::of(profile) has \
+             what fits"
         );
         assert!(
             self.block_download || !self.second_server,
@@ -549,9 +550,10 @@ impl Product {
     }
 }
 
-/// Whether the dialect is that of Paulus, whose manual says "SDO block transfer: no".
-const fn is_paulus(profile: &Profile) -> bool {
-    matches!(profile.unknown_request, AbortCode::GENERAL)
+/// Whether the tools of the dialect may use SDO block transfer: Paulus' manual says "no", and ESAcademy's paper names
+/// none.
+const fn has_block_transfer(profile: &Profile) -> bool {
+    !matches!(profile.unknown_request, AbortCode::GENERAL) && !sends_hex(profile)
 }
 
 /// Whether the dialect is ESAcademy's, whose tools send Intel HEX.

@@ -409,7 +409,7 @@ const PRODUCTS: &[(&str, &str)] = &[
     ("lss_identify: true", "program_date, auto_bit_rate and lss_identify need the split map"),
     ("lss: true, ..Product::of(Profile::LIFT)", "lss needs the split map in a profile with a password"),
     ("crc: CrcKind::Crc16", "CrcKind::Crc16 needs the split map"),
-    ("block_download: true, ..Product::of(Profile::PAULUS)", "block_download needs the split map in Paulus' profile"),
+    ("block_download: true, ..Product::of(Profile::PAULUS)", "block_download needs the split map in the profiles PAULUS"),
     ("intel_hex: true", "intel_hex needs the split map, or ESAcademy's profile"),
     ("segments_per_sub_block: 128", "segments_per_sub_block must be 1 to 127"),
     ("receive_queue: 7", "receive_queue must be 8 or more"),

@@ -88,9 +88,9 @@ impl Judge<'_> {
         if self.region.contains(place.base, place.size) {
             return Ok(());
         }
-        let [first, second] = self.layout.parameters.map(Some);
-        let secured = [Some(self.layout.bootloader), self.layout.home, first, second, self.layout.data];
-        let touches = |region: &Region| {
+        let Layout { bootloader, home, parameters: [first, second], data, .. } = self.layout;
+        let secured = [Some(bootloader), home.as_ref(), Some(first), Some(second), data.as_ref()];
+        let touches = |region: &&Region| {
             // Written without a sum: an address near the end of the address space must not wrap.
             place.base < region.end() && (place.base >= region.base || region.base - place.base < place.size)
         };
