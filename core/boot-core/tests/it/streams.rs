@@ -221,7 +221,7 @@ fn what_is_seen_in_time_erases_nothing() {
             record(address as u16, 0, data)
         )
     };
-    // As objcopy writes a program, whose label comes after the gap behind its vectors.
+    // As objcopy writes a program, whose label comes after the gap after its vectors.
     let mut other = image.clone();
     other[0x1E0..0x200].copy_from_slice(&Label::new(IDENTITY.0, IDENTITY.1 ^ 1, 7).emit());
     let without = |text: &str, gap: core::ops::Range<usize>| {
