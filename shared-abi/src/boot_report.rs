@@ -160,8 +160,7 @@ impl BootReport {
     /// The report in a record; `None` if the record is damaged.
     #[must_use]
     pub const fn parse(words: &Words) -> Option<Self> {
-        let [version, _, length, length_high] = words[1].to_le_bytes();
-        let length = u16::from_le_bytes([length, length_high]) as usize;
+        let (version, length) = (words[1] as u16, words[1] as usize >> 16);
         if words[0] != MAGIC || version == 0 || length != size_of::<Words>() || words[11] != check_of(words) {
             return None;
         }

@@ -29,7 +29,7 @@ pub struct Label {
     pub version: u32,
     /// The creation date, seconds since 1970-01-01 UTC; 0 if unknown.
     pub date: u32,
-    /// 0.
+    /// 0; later labels may define these words.
     pub reserved: [u32; 2],
     /// [`check_word`] of the seven words before.
     pub check: u32,
@@ -64,13 +64,13 @@ impl Label {
     /// The label in these bytes; `None` if it is missing or damaged.
     #[must_use]
     pub fn parse(bytes: &[u8; SIZE]) -> Option<Self> {
-        let word = |i: usize| {
+        let words: [u32; SIZE / 4] = core::array::from_fn(|i| {
             let at = 4 * i;
             u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
-        };
-        let label = Self::dated(word(1), word(2), word(3), word(4));
-        let found = Self { magic: word(0), reserved: [word(5), word(6)], check: word(7), ..label };
-        (found == label).then_some(label)
+        });
+        let [magic, vendor_id, product_code, version, date, a, b, check] = words;
+        let label = Self { magic, vendor_id, product_code, version, date, reserved: [a, b], check };
+        (magic == MAGIC && check == check_word(&words[..7])).then_some(label)
     }
 }
 

@@ -1,72 +1,224 @@
-//! The ABI between bootloader, application and tools, byte for byte.
+//! The records of the ABI, byte for byte: what is written today is the golden copy `records.txt`, and reads as what
+//! was written. And the memory map.
 
-use std::mem::{align_of, offset_of, size_of};
+use std::mem::{offset_of, size_of};
+use std::sync::LazyLock;
+use std::task::Poll;
 
-use shared_abi::callgate::{self, Crc32Args};
-use shared_abi::geometry::{Region, OTP};
+use boot_core::canopen::{BitRate, NodeId};
+use boot_core::flash::{run, Flash, FlashFault, Operation};
+use boot_core::store::record::Seal;
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
+use coboot_app::callgate::Callgate;
+use seal::key_block::{find, COUNTER, EPOCH, FLAGS, FOR_TESTS, KEKS, KEK_COUNT, KEY, ROOTS, ROOT_COUNT};
+use shared_abi::abilities::Abilities;
+use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Table};
+use shared_abi::geometry::{Region, Sector};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
-use shared_abi::nameplate::{self, Nameplate};
-use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
+use shared_abi::label::Label;
+use shared_abi::nameplate::Nameplate;
+use shared_abi::ram_image::{self, Header, Host};
+use shared_abi::renewal::{self, of_word, Origin, State, TrialEnd};
+use shared_abi::services::{Facts, Services};
+use shared_abi::warm_start::{BootRequest, Damage, Owed, StoredNode, TrialStep, WarmStart};
+
+/// What a test says about a change.
+pub const FROZEN: &str = "images and devices in the field have it as it was. A new field goes to the end, or into a \
+                          reserved word; a new number is the next that is free (shared-abi/src/lib.rs)";
+
+/// A record of the golden copy.
+pub struct Golden {
+    pub name: &'static str,
+    /// The structure of coboot.h, if there is one.
+    pub structure: Option<&'static str>,
+    /// Each field with its offset.
+    pub fields: Vec<(&'static str, usize)>,
+    pub bytes: Vec<u8>,
+}
+
+/// The golden copy.
+pub fn golden() -> &'static [Golden] {
+    static RECORDS: LazyLock<Vec<Golden>> =
+        LazyLock::new(|| include_str!("records.txt").split("\n[").skip(1).map(record).collect());
+    &RECORDS
+}
+
+fn record(section: &'static str) -> Golden {
+    let (head, lines) = section.split_once('\n').unwrap();
+    let (name, structure) = head.split_once(']').unwrap();
+    let (mut fields, mut bytes) = (Vec::new(), Vec::new());
+    for line in lines.lines().filter(|line| !line.is_empty()) {
+        let (offset, field, data) = (line[..3].trim(), line[4..22].trim(), &line[23..]);
+        assert_eq!(offset.parse(), Ok(bytes.len()), "{name}: {field}");
+        fields.push((field, bytes.len()));
+        for data in data.split(' ') {
+            let (byte, count) = data.split_once('*').unwrap_or((data, "1"));
+            let byte = u8::from_str_radix(byte, 16).unwrap();
+            bytes.extend(vec![byte; count.parse().unwrap()]);
+        }
+    }
+    Golden { name, structure: structure.strip_prefix(" struct "), fields, bytes }
+}
 
 /// The bytes of a structure in RAM. (The host is little-endian, like the chip.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
     const { assert!(cfg!(target_endian = "little")) };
-    // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding (the sizes are checked
-    // in these tests).
+    // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding: they have the size of the golden copy.
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast(), size_of::<T>()) }.to_vec()
 }
 
-/// The check words below come from an implementation of the fold in another language.
-#[test]
-fn warm_start_cell_byte_for_byte() {
-    assert_eq!((size_of::<WarmStart>(), align_of::<WarmStart>()), (16, 4));
-    assert_eq!(offset_of!(WarmStart, magic), 0);
-    assert_eq!(offset_of!(WarmStart, request), 4);
-    assert_eq!(offset_of!(WarmStart, argument), 8);
-    assert_eq!(offset_of!(WarmStart, check), 12);
-    #[rustfmt::skip]
-    let cells: [(BootRequest, [u8; 16]); 6] = [
-        (BootRequest::Stay, [b'C', b'B', b'W', b'1', 1, 0, 0, 0, 0, 0, 0, 0, 0xF0, 0xB7, 0x28, 0xD9]),
-        (BootRequest::Trial(1), [b'C', b'B', b'W', b'1', 2, 0, 0, 0, 1, 0, 0, 0, 0xCD, 0x59, 0x20, 0xE5]),
-        (BootRequest::Start(1), [b'C', b'B', b'W', b'1', 3, 0, 0, 0, 1, 0, 0, 0, 0xF9, 0x81, 0xE0, 0x52]),
-        (BootRequest::Fresh(1), [b'C', b'B', b'W', b'1', 9, 0, 0, 0, 1, 0, 0, 0, 0x5F, 0xD5, 0xAC, 0xE8]),
-        // STOP of program 1, sent to node 5; CLEAR of program 2, sent to node 127.
-        (BootRequest::Owed(Owed { program: 1, value: 0, node_id: 5 }),
-         [b'C', b'B', b'W', b'1', 7, 0, 0, 0, 1, 0, 5, 0, 0x56, 0xAA, 0x9D, 0xE8]),
-        (BootRequest::Owed(Owed { program: 2, value: 3, node_id: 127 }),
-         [b'C', b'B', b'W', b'1', 7, 0, 0, 0, 2, 3, 127, 0, 0xA5, 0x7F, 0x86, 0xCC]),
-    ];
-    for (request, expected) in cells {
-        assert_eq!(bytes(&WarmStart::new(request)), expected);
+/// The structure with these bytes.
+pub fn of_bytes<T: Copy>(bytes: &[u8]) -> T {
+    assert_eq!(bytes.len(), size_of::<T>());
+    // SAFETY: `T` is one of the ABI's structures of integers, and there are as many bytes as it has.
+    unsafe { bytes.as_ptr().cast::<T>().read_unaligned() }
+}
+
+pub fn word(bytes: &[u8], at: usize) -> u32 {
+    of_bytes(&bytes[at..at + 4])
+}
+
+/// A flash that takes words.
+struct Words(Vec<u8>);
+
+/// The two regions of its journal.
+const REGIONS: [Region; 2] = [Region::new(0, 0x200), Region::new(0x200, 0x200)];
+
+impl Words {
+    fn with(bytes: &[u8]) -> Self {
+        let mut flash = vec![0xFF; 0x400];
+        flash[..bytes.len()].copy_from_slice(bytes);
+        Self(flash)
     }
 }
 
-#[test]
-fn handoff_byte_for_byte() {
-    assert_eq!((size_of::<Handoff>(), align_of::<Handoff>()), (48, 4));
-    let offsets = [
-        (offset_of!(Handoff, magic), 0),
-        (offset_of!(Handoff, version), 4),
-        (offset_of!(Handoff, length), 6),
-        (offset_of!(Handoff, node_id), 8),
-        (offset_of!(Handoff, program), 9),
-        (offset_of!(Handoff, reset_cause), 10),
-        (offset_of!(Handoff, trial), 11),
-        (offset_of!(Handoff, bit_rate), 12),
-        (offset_of!(Handoff, bootloader_version), 16),
-        (offset_of!(Handoff, serial_number), 20),
-        (offset_of!(Handoff, flags), 24),
-        (offset_of!(Handoff, bootloader_number), 28),
-        (offset_of!(Handoff, sdo_request_base), 32),
-        (offset_of!(Handoff, sdo_response_base), 34),
-        (offset_of!(Handoff, program_date), 36),
-        (offset_of!(Handoff, reserved), 40),
-        (offset_of!(Handoff, check), 44),
-    ];
-    for (actual, expected) in offsets {
-        assert_eq!(actual, expected);
+impl Flash for Words {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        buffer.copy_from_slice(&self.0[address as usize..][..buffer.len()]);
     }
-    let handoff = Handoff::new(&BootInfo {
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        let Operation::Program { address, word } = operation else { panic!("a new device needs no erase") };
+        self.0[address as usize..][..4].copy_from_slice(&word.to_le_bytes());
+        Ok(())
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn sector_at(&self, _: u32) -> Option<Sector> {
+        None
+    }
+}
+
+/// The bytes of a journal's header and of its first record.
+fn journal(key: Key, value: Value) -> [Vec<u8>; 2] {
+    let mut flash = Words::with(&[]);
+    let mut journal = Journal::open(&flash, REGIONS);
+    journal.store(key, value);
+    run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+    [flash.0[..28].to_vec(), flash.0[28..56].to_vec()]
+}
+
+/// What the reader of a record makes of its bytes.
+pub fn read(record: &str, bytes: &[u8]) -> String {
+    match record.split_once(": ").unwrap_or((record, "")) {
+        ("warm-start cell", "mark") => format!("{:?}", of_bytes::<WarmStart>(bytes) == WarmStart::MARKED),
+        ("warm-start cell", _) => format!("{:?}", of_bytes::<WarmStart>(bytes).request()),
+        ("handoff", _) => format!("{:?}", of_bytes::<Handoff>(bytes).info()),
+        ("boot report", _) => {
+            let seen = |report: BootReport| (report, Reason::from_byte(report.reason), of_word(report.renewal));
+            let report = BootReport::parse(&of_bytes(bytes)).map(seen);
+            format!("{:?}", report.map(|(report, reason, end)| (BootReport { renewal: 0, ..report }, reason, end)))
+        }
+        ("nameplate", _) => {
+            let plate = Nameplate::parse(&of_bytes(bytes));
+            format!("{:?}", plate.map(|it| [it.vendor_id, it.product_code, it.revision, it.serial_number]))
+        }
+        ("label", _) => {
+            let label = Label::parse(&of_bytes(bytes));
+            format!("{:?}", label.map(|it| [it.vendor_id, it.product_code, it.version, it.date]))
+        }
+        ("callgate", _) => {
+            format!("{:?}", Callgate::check(of_bytes::<Table>(bytes)).map(|gate| gate.bootloader_version()))
+        }
+        ("arguments", "CRC") => format!("{:?}", of_bytes::<Crc32Args>(bytes)),
+        ("arguments", "node") => format!("{:?}", of_bytes::<NodeArgs>(bytes)),
+        ("arguments", _) => format!("{:?}", of_bytes::<ProgramArgs>(bytes)),
+        ("RAM image header", _) => {
+            let ram = Region::new(0x2000_0000, 0x1_FFC0);
+            // It also has an ability of the future.
+            let (features, facts) = (Abilities(1 << 15 | 0x0A), 0x0FAC_7500);
+            let host = Host { board: 0x1234_5678, services: 2, features, facts };
+            format!("{:?}", Header::of_bytes(&of_bytes(bytes)).check(0x4000, ram, host))
+        }
+        // More of the resident part follows.
+        ("services and facts", _) => {
+            format!("{:?}", Facts::of_resident(&Words::with(bytes).0, 0x0800_0000, 0x0800_0000))
+        }
+        ("key block", _) => {
+            let roots = [0x11, 0x12].map(|id| find(bytes, ROOTS, ROOT_COUNT, id));
+            let keks = [0x21, 0x22].map(|id| find(bytes, KEKS, KEK_COUNT, id));
+            format!("{:?}", (roots, keks))
+        }
+        ("journal", "header") => of_journal(bytes, &named("journal: node-ID and bit rate").bytes),
+        ("journal", _) => of_journal(&named("journal: header").bytes, bytes),
+        _ => panic!("{record}"),
+    }
+}
+
+fn of_journal(header: &[u8], record: &[u8]) -> String {
+    let flash = Words::with(&[header, record].concat());
+    let (journal, key) = (Journal::open(&flash, REGIONS), Key(word(record, 0)));
+    let Some(value) = journal.get(&flash, key) else { return "None".to_owned() };
+    match key.0 {
+        0x1_00FF => format!("{:?}", RenewalRecord::from_value(value)),
+        0x1_0001..=0x1_00FE => {
+            format!("{:?}", (ProgramRecord::from_value(value), ProgramRecord::partial_of(value).words()))
+        }
+        0x3_0000 => {
+            let board = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K10 };
+            format!("{:?}", NodeParameters::load(&journal, &flash, board, |_| true))
+        }
+        _ => format!("{value:08X?}"),
+    }
+}
+
+/// The record of the golden copy with this name.
+pub fn named(name: &str) -> &'static Golden {
+    golden().iter().find(|record| record.name == name).unwrap_or_else(|| panic!("no {name}"))
+}
+
+/// What writes each record today, from the values of the golden copy, and what its reader sees then.
+fn written() -> Vec<(String, Vec<u8>, String)> {
+    let some = |value: &dyn std::fmt::Debug| format!("Some({value:?})");
+    let mut all = Vec::new();
+    let mut add = |name: &str, bytes, seen: String| all.push((name.to_owned(), bytes, seen));
+
+    for (name, request) in [
+        ("answer owed", BootRequest::Owed(Owed { program: 2, value: 3, node_id: 127 })),
+        ("stay", BootRequest::Stay),
+        ("trial", BootRequest::Trial(254)),
+        ("start", BootRequest::Start(1)),
+        ("fault", BootRequest::Fault),
+        ("power-on", BootRequest::PowerOn),
+        ("resume", BootRequest::Resume(2)),
+        ("damaged", BootRequest::Damaged(Damage::Facts)),
+        ("fresh", BootRequest::Fresh(1)),
+        ("confirm", BootRequest::Confirm(1)),
+        ("invalidate", BootRequest::Invalidate(254)),
+        ("store node", BootRequest::StoreNode(StoredNode::new(127, 1_000_000))),
+        ("renewal", BootRequest::Renewal(TrialStep::GivenUp)),
+        ("ROM loader", BootRequest::RomLoader),
+        ("rescue", BootRequest::Rescue),
+    ] {
+        add(&format!("warm-start cell: {name}"), bytes(&WarmStart::new(request)), some(&request));
+    }
+    add("warm-start cell: mark", bytes(&WarmStart::MARKED), "true".to_owned());
+
+    let info = BootInfo {
         node_id: 5,
         bit_rate: 125_000,
         program: 1,
@@ -79,62 +231,176 @@ fn handoff_byte_for_byte() {
         sdo: SdoBases { request: 0x680, response: 0x480 },
         program_date: 1_795_804_215,
         nameplate: true,
-    });
-    #[rustfmt::skip]
-    let expected = [
-        b'C', b'B', b'H', b'O', 5, 0, 48, 0,
-        5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
-        0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        3, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0x37, 0xCC, 0x09, 0x6B, 0, 0, 0, 0,
-        0xD4, 0x71, 0x22, 0x61,
-    ];
-    assert_eq!(bytes(&handoff), expected);
-}
+    };
+    add("handoff", bytes(&Handoff::new(&info)), some(&info));
+    let report = BootReport {
+        reason: 14,
+        held_program: 2,
+        window_ms: 0x0403,
+        owed: Owed { program: 5, value: 3, node_id: 7 },
+        returned: 8,
+        node_id: 9,
+        bit_rate: 4,
+        program_reset: 8,
+        crash_resets: 12,
+        refused: 13,
+        renewal: 0,
+    };
+    let end = (Origin::Confirmed, TrialEnd::Reset(ResetCause::IndependentWatchdog));
+    let words = BootReport { renewal: renewal::word(end.0, end.1), ..report }.words();
+    add("boot report", bytes(&words), some(&(report, Some(Reason::Compaction), end)));
+    let plate = Nameplate::new(0x123, 0x5EA1_0007, 0x0002_0003, 123_456).words();
+    add("nameplate", bytes(&plate), some(&[0x123, 0x5EA1_0007, 0x0002_0003, 123_456]));
+    let label = Label::dated(0x319, 0x4007_D151, 0x0001_0203, 1_795_804_215).emit();
+    add("label", label.to_vec(), some(&[0x319, 0x4007_D151, 0x0001_0203, 1_795_804_215]));
+    let table = Table {
+        magic: callgate::MAGIC,
+        abi_version: callgate::ABI_VERSION,
+        length: callgate::TABLE_SIZE as u16,
+        bootloader_version: 0x0001_0002,
+        entry: 0x0800_0211,
+    };
+    add("callgate", bytes(&table), "Ok(65538)".to_owned());
+    let crc = Crc32Args { address: 0x0802_0000, len: 9, crc: 0xCBF4_3926 };
+    add("arguments: CRC", bytes(&crc), format!("{crc:?}"));
+    let node = NodeArgs { node_id: 42, bit_rate: 250_000 };
+    add("arguments: node", bytes(&node), format!("{node:?}"));
+    let program = ProgramArgs { number: 2, size: 4096, crc: 5, version: 6, flags: 3 };
+    add("arguments: program", bytes(&program), format!("{program:?}"));
+    let header = Header {
+        magic: ram_image::MAGIC,
+        crc: 0xA1A2_A3A4,
+        length: Header::SIZE,
+        size: 0x4000,
+        ram_base: 0x2000_0000,
+        ram_end: 0x2001_FFC0,
+        services: ram_image::SERVICES_VERSION,
+        features: Abilities::NONE.with(Abilities::RENEWAL, true).with(Abilities::NAMEPLATE, true),
+        board: 0x1234_5678,
+        vendor: 7,
+        product: 8,
+        revisions: 9,
+        version: 0x0001_0002,
+        counter: 5,
+        facts: 0x0FAC_7500,
+        reserved: 0,
+    };
+    add("RAM image header", bytes(&header), "Ok(())".to_owned());
 
-/// The check words come from the same implementation in another language.
-#[test]
-fn nameplate_byte_for_byte() {
-    assert_eq!((size_of::<Nameplate>(), align_of::<Nameplate>()), (32, 4));
-    assert_eq!(offset_of!(Nameplate, magic), 0);
-    assert_eq!(offset_of!(Nameplate, vendor_id), 4);
-    assert_eq!(offset_of!(Nameplate, product_code), 8);
-    assert_eq!(offset_of!(Nameplate, revision), 12);
-    assert_eq!(offset_of!(Nameplate, serial_number), 16);
-    assert_eq!(offset_of!(Nameplate, reserved), 20);
-    assert_eq!(offset_of!(Nameplate, check), 28);
-    // RM0090 table 19: blocks of 32 bytes from 1FFF_7800h on, the last at 1FFF_79E0h.
-    assert_eq!((OTP.base, OTP.end(), nameplate::BLOCKS), (0x1FFF_7800, 0x1FFF_7A00, 16));
-    let [mut with, mut without] = [[0; 32]; 2];
-    for (made, plate) in [(&mut with, 123_456), (&mut without, 0)] {
-        let words = Nameplate::new(0x123, 0x5EA1_0007, 0x0002_0003, plate).words();
-        made.copy_from_slice(words.map(u32::to_le_bytes).as_flattened());
+    let facts = Facts {
+        board: 0x1234_5678,
+        size: Facts::SIZE,
+        autostart: 0x0201,
+        crc_bits: 32,
+        node_ids: 0x7F01,
+        bit_rates: 0x1FF,
+        abilities: header.features.0 as u16,
+        sdo_request_base: 0x680,
+        sdo_response_base: 0x480,
+    };
+    // Pointers of the chip have four bytes.
+    let on_chip = |offset: usize| 8 + (offset - 8) * 4 / size_of::<usize>();
+    let mut services = vec![0; on_chip(size_of::<Services>())];
+    let size = services.len() as u32;
+    for (at, word) in [
+        (offset_of!(Services, version), ram_image::SERVICES_VERSION),
+        (offset_of!(Services, size), size),
+        (on_chip(offset_of!(Services, open)), 0x0800_0101),
+        (on_chip(offset_of!(Services, get)), 0x0800_0103),
+        (on_chip(offset_of!(Services, store)), 0x0800_0105),
+        (on_chip(offset_of!(Services, next)), 0x0800_0107),
+        (on_chip(offset_of!(Services, crc32)), 0x0800_0109),
+        (on_chip(offset_of!(Services, is_blank)), 0x0800_010B),
+        (on_chip(offset_of!(Services, sector_at)), 0x0800_010D),
+        (on_chip(offset_of!(Services, facts)), 0x0800_0000 + size),
+        (on_chip(offset_of!(Services, compact)), 0x0800_010F),
+    ] {
+        services[at..at + 4].copy_from_slice(&word.to_le_bytes());
     }
-    #[rustfmt::skip]
-    assert_eq!(with, [
-        b'C', b'B', b'N', b'P', 0x23, 0x01, 0, 0, 0x07, 0, 0xA1, 0x5E, 3, 0, 2, 0,
-        0x40, 0xE2, 0x01, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xFE, 0x3F, 0x2A, 0x54,
-    ]);
-    #[rustfmt::skip]
-    assert_eq!(without, [
-        b'C', b'B', b'N', b'P', 0x23, 0x01, 0, 0, 0x07, 0, 0xA1, 0x5E, 3, 0, 2, 0,
-        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xEC, 0x22, 0x54, 0x33,
-    ]);
+    services.extend(bytes(&facts));
+    add("services and facts", services, some(&(2, facts)));
+
+    let plain = ProgramRecord {
+        size: 0x1_2340,
+        crc: 0xCAFE_F00D,
+        signed: true,
+        confirmed: true,
+        version: 77,
+        half_erased: false,
+        seal: None,
+        withdrawn: false,
+    };
+    let sealed = ProgramRecord { signed: false, seal: Some(Seal::Locked), ..plain };
+    for (name, number, record) in [
+        ("released and confirmed", 1, plain),
+        ("released", 1, ProgramRecord { confirmed: false, ..plain }),
+        ("confirmed, sealed and withdrawn", 254, ProgramRecord { half_erased: true, withdrawn: true, ..sealed }),
+        ("sealed and writing", 2, ProgramRecord { confirmed: false, seal: Some(Seal::WritesFlash), ..sealed }),
+    ] {
+        let [_, made] = journal(Key::program(number), record.value());
+        add(&format!("journal: program, {name}"), made, format!("{:?}", (Some(record), [0_u32; 2])));
+    }
+    let partial = [0x1122_3344, 0x0802_8000];
+    let [id, end] = partial;
+    let value = ProgramRecord::none(true, ProgramRecord::partial_of([0, id, end, 0]));
+    let [_, made] = journal(Key::program(1), value);
+    let none = None::<ProgramRecord>;
+    add("journal: no program, a download goes on", made, format!("{:?}", (none, partial)));
+    for (name, state) in
+        [("staged", State::Staged), ("confirmed", State::Confirmed), ("installed", State::Installed)]
+    {
+        let record = RenewalRecord { state, size: 0x9000, crc: 0xCAFE_F00D, home: 0x0BAD_CAFE };
+        let [_, made] = journal(Key::program(renewal::BOOTLOADER), record.value());
+        add(&format!("journal: RAM image, {name}"), made, some(&record));
+    }
+    for (name, id, bit_rate) in
+        [("node-ID and bit rate", NodeId::new(127), BitRate::K125), ("no node-ID", None, BitRate::Auto)]
+    {
+        let node = NodeParameters { id, bit_rate };
+        let [header, made] = journal(Key::NODE, node.value());
+        add(&format!("journal: {name}"), made, format!("{node:?}"));
+        if id.is_some() {
+            add("journal: header", header, format!("{node:?}"));
+        }
+    }
+
+    let mut block = vec![0; seal::key_block::SIZE];
+    for (at, data) in [
+        (0, &seal::key_block::MAGIC[..]),
+        (FLAGS, &FOR_TESTS.to_le_bytes()),
+        (COUNTER, &[7]),
+        (EPOCH, &[2]),
+        (ROOTS, &[0x11]),
+        (ROOTS + 4, &[0xA1; 32]),
+        (ROOTS + KEY, &[0x12]),
+        (ROOTS + KEY + 4, &[0xA2; 32]),
+        (KEKS, &[0x21]),
+        (KEKS + 4, &[0xB1; 32]),
+        (KEKS + KEY, &[0x22]),
+        (KEKS + KEY + 4, &[0xB2; 32]),
+    ] {
+        block[at..at + data.len()].copy_from_slice(data);
+    }
+    let check = boot_core::crc32(&block[..seal::key_block::CHECK]);
+    block[seal::key_block::CHECK..].copy_from_slice(&check.to_le_bytes());
+    add("key block", block, "([Some(16), Some(52)], [Some(88), Some(124)])".to_owned());
+    all
 }
 
 #[test]
-fn callgate_byte_for_byte() {
-    type Table = callgate::Table<u32>;
-    assert_eq!(size_of::<Table>(), callgate::TABLE_SIZE as usize);
-    assert_eq!(offset_of!(Table, magic), 0);
-    assert_eq!(offset_of!(Table, abi_version), 4);
-    assert_eq!(offset_of!(Table, length), 6);
-    assert_eq!(offset_of!(Table, bootloader_version), 8);
-    assert_eq!(offset_of!(Table, entry), 12);
-    assert_eq!(size_of::<Crc32Args>(), 12);
-    assert_eq!(offset_of!(Crc32Args, address), 0);
-    assert_eq!(offset_of!(Crc32Args, len), 4);
-    assert_eq!(offset_of!(Crc32Args, crc), 8);
-    assert_eq!(callgate::Selector::Crc32 as u32, 1);
+fn every_record_is_the_golden_one() {
+    let written = written();
+    for Golden { name, bytes, .. } in golden() {
+        let (_, made, seen) =
+            written.iter().find(|(made, ..)| made == name).unwrap_or_else(|| panic!("nothing writes {name}"));
+        assert!(
+            made == bytes && read(name, bytes) == *seen,
+            "{name} has changed: {FROZEN}.\n\
+             golden  {bytes:02X?}\nwritten {made:02X?}\nread    {}\n        {seen}",
+            read(name, bytes)
+        );
+    }
+    assert_eq!(written.len(), golden().len(), "records.txt has not all of them");
 }
 
 /// The memory map of the design, typed again: the only second copy of these numbers.

@@ -7,4 +7,5 @@ mod header;
 mod layout;
 mod manuals;
 mod numbers;
+mod old_and_new;
 mod reentry;

@@ -1,22 +1,47 @@
-//! Every number of coboot.h, the C header of the ABI, against `shared-abi`. (Its assertions hold the
-//! layout of the structures against the numbers when a C compiler reads it.)
+//! The numbers of the ABI: those of `shared-abi` are the golden copy `numbers.txt`, and coboot.h, the C header, has
+//! the same, with the offsets of `records.txt`. (Its assertions hold the layout of the structures against these
+//! when a C compiler reads it.)
 
 use std::collections::BTreeMap;
-use std::mem::{offset_of, size_of};
+use std::fmt::Debug;
 
-use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
+use boot_core::store::Key;
+use shared_abi::abilities::Abilities;
+use shared_abi::boot_report::Reason;
+use shared_abi::callgate::{self, Selector, Status};
 use shared_abi::geometry::OTP;
-use shared_abi::handoff::{self, Handoff, ResetCause};
-use shared_abi::label::{self, Label};
-use shared_abi::nameplate::{self, Nameplate};
-use shared_abi::renewal;
-use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
+use shared_abi::handoff::{self, ResetCause};
+use shared_abi::renewal::{self, Origin};
+use shared_abi::services::{self, OperationResult, Step};
+use shared_abi::warm_start::{self, Damage, TrialStep, WarmStart};
+use shared_abi::{label, nameplate};
+
+use crate::layout::{golden, FROZEN};
 
 const HEADER: &str = include_str!("../../examples/c/coboot/coboot.h");
 
+type Numbers = BTreeMap<String, i64>;
+
+/// The golden copy: the numbers that C has, too, and the others.
+fn frozen() -> [Numbers; 2] {
+    let number = |line: &str| {
+        let (name, digits) = line.split_once(' ')?;
+        Some((name.to_owned(), i64::from_str_radix(digits, 16).ok()?))
+    };
+    let sections: Vec<_> = include_str!("numbers.txt").split("\n[").skip(1).collect();
+    let [in_c, others] = sections[..] else { panic!("numbers.txt has two sections") };
+    let mut in_c: Numbers = in_c.lines().filter_map(number).collect();
+    for record in golden() {
+        let Some(structure) = record.structure else { continue };
+        in_c.insert(format!("sizeof(struct {structure})"), record.bytes.len() as i64);
+        in_c.extend(record.fields.iter().map(|(field, at)| (format!("offsetof(struct {structure}, {field})"), *at as i64)));
+    }
+    [in_c, others.lines().filter_map(number).collect()]
+}
+
 /// The numbers of the header by what they are: the name after `COBOOT_`, or what an assertion is
 /// about.
-fn of_header() -> BTreeMap<String, i64> {
+fn of_header() -> Numbers {
     let number = |text: &str| match text.strip_prefix("0x") {
         Some(digits) => i64::from_str_radix(digits, 16).unwrap(),
         None => text.parse().unwrap(),
@@ -33,36 +58,28 @@ fn of_header() -> BTreeMap<String, i64> {
     HEADER.lines().filter_map(entry).collect()
 }
 
-/// The size and the offsets of a structure, as the header's assertions have them.
-macro_rules! structure {
-    ($name:literal, $rust:ty, $($field:ident),+) => {
-        [
-            (format!("sizeof(struct {})", $name), size_of::<$rust>()),
-            $((format!("offsetof(struct {}, {})", $name, stringify!($field)), offset_of!($rust, $field))),+
-        ]
-        .map(|(what, number)| (what, number as i64))
+/// All numbers that a reader knows, with their names as in C.
+fn known<T: Debug>(prefix: &str, of: impl Fn(u8) -> Option<T>) -> Vec<(String, i64)> {
+    let name = |value: T| {
+        let mut name = prefix.to_owned();
+        for letter in format!("{value:?}").chars().take_while(char::is_ascii_alphanumeric) {
+            let separator = if letter.is_uppercase() { "_" } else { "" };
+            name += &format!("{separator}{}", letter.to_ascii_uppercase());
+        }
+        name
     };
+    (0..=u8::MAX).filter_map(|number| Some((name(of(number)?), number.into()))).collect()
 }
 
-/// The same of `shared-abi`.
-fn of_rust() -> BTreeMap<String, i64> {
-    let request = |request| WarmStart::new(request).request;
-    let owed = Owed { program: 1, value: 0, node_id: 1 };
-    let mut all: BTreeMap<String, i64> = [
+/// Those of `shared-abi`, and of the journal. A number that a reader takes for another one is not known to it.
+fn of_rust() -> Numbers {
+    let mut all: Numbers = [
         ("CHECK_SEED", shared_abi::CHECK_SEED),
         ("CHECK_ROTATION", shared_abi::CHECK_ROTATION),
         ("CHECK_FACTOR", shared_abi::CHECK_FACTOR),
         ("LABEL_MAGIC", label::MAGIC),
+        ("LABEL_OFFSET", label::OFFSET),
         ("WARM_START_MAGIC", warm_start::MAGIC),
-        ("REQUEST_STAY", request(BootRequest::Stay)),
-        ("REQUEST_TRIAL", request(BootRequest::Trial(1))),
-        ("REQUEST_START", request(BootRequest::Start(1))),
-        ("REQUEST_POWER_ON", request(BootRequest::PowerOn)),
-        ("REQUEST_OWED", request(BootRequest::Owed(owed))),
-        ("REQUEST_CONFIRM", request(BootRequest::Confirm(1))),
-        ("REQUEST_INVALIDATE", request(BootRequest::Invalidate(1))),
-        ("REQUEST_STORE_NODE", request(BootRequest::StoreNode(StoredNode::new(1, 0)))),
-        ("REQUEST_RESCUE", request(BootRequest::Rescue)),
         ("HANDOFF_MAGIC", handoff::MAGIC),
         ("HANDOFF_VERSION", handoff::VERSION.into()),
         ("HANDOFF_OLDEST", handoff::OLDEST.into()),
@@ -71,133 +88,85 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("NAMEPLATE_MAGIC", nameplate::MAGIC),
         ("OTP", OTP.base),
         ("OTP_BLOCKS", nameplate::BLOCKS as u32),
-        ("RESET_UNKNOWN", ResetCause::Unknown as u32),
-        ("RESET_POWER_ON", ResetCause::PowerOn as u32),
-        ("RESET_PIN", ResetCause::Pin as u32),
-        ("RESET_SOFTWARE", ResetCause::Software as u32),
-        ("RESET_INDEPENDENT_WATCHDOG", ResetCause::IndependentWatchdog as u32),
-        ("RESET_WINDOW_WATCHDOG", ResetCause::WindowWatchdog as u32),
-        ("RESET_LOW_POWER", ResetCause::LowPower as u32),
-        ("RESET_BROWN_OUT", ResetCause::BrownOut as u32),
-        ("RESET_STANDBY", ResetCause::Standby as u32),
         ("CALLGATE_MAGIC", callgate::MAGIC),
         ("CALLGATE_ABI_VERSION", callgate::ABI_VERSION.into()),
         ("CALLGATE_TABLE_SIZE", callgate::TABLE_SIZE),
         ("CALLGATE_STACK", callgate::STACK),
-        ("SELECTOR_CRC32", Selector::Crc32 as u32),
-        ("SELECTOR_READ_NODE", Selector::ReadNode as u32),
-        ("SELECTOR_STORE_NODE", Selector::StoreNode as u32),
-        ("SELECTOR_PROGRAM_INFO", Selector::ProgramInfo as u32),
-        ("SELECTOR_CONFIRM", Selector::Confirm as u32),
-        ("SELECTOR_INVALIDATE", Selector::Invalidate as u32),
-        ("SELECTOR_UNCONFIRM", Selector::Unconfirm as u32),
         ("BOOTLOADER", renewal::BOOTLOADER.into()),
         ("PROGRAM_INSTALLED", callgate::PROGRAM_INSTALLED),
         ("PROGRAM_SIGNED", callgate::PROGRAM_SIGNED),
+        ("ABILITY_SEALED", Abilities::SEALED.0),
+        ("ABILITY_RENEWAL", Abilities::RENEWAL.0),
+        ("ABILITY_ROM_LOADER", Abilities::ROM_LOADER.0),
+        ("ABILITY_NAMEPLATE", Abilities::NAMEPLATE.0),
+        ("ABILITY_INSTALL", Abilities::INSTALL.0),
+        ("SERVICES_OFFSET", services::OFFSET),
+        ("OPERATION_ERASE", services::ERASE),
+        ("OPERATION_PROGRAM", services::PROGRAM),
+        ("STORE_STATE_WORDS", services::STORE_STATE_WORDS as u32),
+        ("KEY_PROGRAM", Key::program(0).0),
+        ("KEY_CRASH_COUNT", Key::CRASH_COUNT.0),
+        ("KEY_NODE", Key::NODE.0),
+        ("KEY_COUNTER", Key::counter(0).0),
+        ("KEY_EVENT", Key::event(0).0),
+        ("KEY_GRANTS", Key::GRANTS.0),
+        ("KEY_DATE", Key::date(0).0),
     ]
     .map(|(name, number)| (name.to_owned(), number.into()))
     .into();
-    let codes = [
-        ("OK", Status::Ok),
-        ("UNKNOWN_SELECTOR", Status::UnknownSelector),
-        ("BAD_POINTER", Status::BadPointer),
-        ("BAD_RANGE", Status::BadRange),
-        ("BUSY", Status::Busy),
-        ("FAILED", Status::Failed),
-        ("BAD_ARGUMENT", Status::BadArgument),
-        ("NO_PROGRAM", Status::NoProgram),
-        ("LOCKED", Status::Locked),
-        ("FULL", Status::Full),
-    ];
-    all.extend(codes.map(|(name, code)| (format!("STATUS_{name}"), (code as i32).into())));
-    all.extend(structure!(
-        "coboot_label",
-        Label,
-        magic,
-        vendor_id,
-        product_code,
-        version,
-        date,
-        reserved,
-        check
-    ));
-    all.extend(structure!("coboot_warm_start", WarmStart, magic, request, argument, check));
-    all.extend(structure!(
-        "coboot_handoff",
-        Handoff,
-        magic,
-        version,
-        length,
-        node_id,
-        program,
-        reset_cause,
-        trial,
-        bit_rate,
-        bootloader_version,
-        serial_number,
-        flags,
-        bootloader_number,
-        sdo_request_base,
-        sdo_response_base,
-        program_date,
-        reserved,
-        check
-    ));
-    all.extend(structure!(
-        "coboot_nameplate",
-        Nameplate,
-        magic,
-        vendor_id,
-        product_code,
-        revision,
-        serial_number,
-        reserved,
-        check
-    ));
-    let table =
-        structure!("coboot_callgate", Table<u32>, magic, abi_version, length, bootloader_version, entry);
-    all.extend(table);
-    all.extend(structure!("coboot_crc32_args", Crc32Args, address, len, crc));
-    all.extend(structure!("coboot_node_args", NodeArgs, node_id, bit_rate));
-    all.extend(structure!("coboot_program_args", ProgramArgs, number, size, crc, version, flags));
+    let request = |number: u8| {
+        let request = |argument| WarmStart::encode(number.into(), argument).request();
+        request(0).or(request(1)).filter(|it| WarmStart::new(*it).request == number.into())
+    };
+    all.extend(known("REQUEST", request));
+    all.extend(known("DAMAGE", |number| Damage::from_number(number).filter(|it| *it as u8 == number)));
+    all.extend(known("TRIAL_STEP", |number| TrialStep::from_number(number).filter(|it| *it as u8 == number)));
+    all.extend(known("REASON", |number| Reason::from_byte(number).filter(|it| *it as u8 == number)));
+    all.extend(known("RESET", |number| Some(ResetCause::from_byte(number)).filter(|it| *it as u8 == number)));
+    all.extend(known("ORIGIN", |number| Some(Origin::from_byte(number)).filter(|it| *it as u8 == number)));
+    all.extend(known("SELECTOR", |number| {
+        Selector::from_number(number.into()).filter(|it| *it as u32 == number.into())
+    }));
+    all.extend(known("RESULT", |number| {
+        Some(OperationResult::from_number(number.into())).filter(|it| *it as u32 == number.into())
+    }));
+    all.extend(known("STEP", |number| {
+        Some(Step::from_number(number.into())).filter(|it| *it as u32 == number.into())
+    }));
+    for status in [
+        Status::Ok,
+        Status::UnknownSelector,
+        Status::BadPointer,
+        Status::BadRange,
+        Status::Busy,
+        Status::Failed,
+        Status::BadArgument,
+        Status::NoProgram,
+        Status::Locked,
+        Status::Full,
+    ] {
+        let [(name, _)] = &known("STATUS", |number| (number == 0).then_some(status))[..] else { unreachable!() };
+        all.insert(name.clone(), (status as i32).into());
+    }
     all
 }
 
 #[test]
-fn every_number_of_the_c_header_is_that_of_the_library() {
-    let (header, rust) = (of_header(), of_rust());
-    let differs = |(what, number): &(&String, &i64)| rust.get(*what) != Some(*number);
-    let wrong: Vec<_> = header.iter().filter(differs).collect();
-    assert!(wrong.is_empty(), "coboot.h has other numbers than shared-abi: {wrong:?}");
-    let missing: Vec<_> = rust.keys().filter(|what| !header.contains_key(*what)).collect();
-    assert!(missing.is_empty(), "coboot.h has no {missing:?}");
+fn every_number_is_the_golden_one_in_rust_and_in_c() {
+    let [in_c, others] = frozen();
+    let differs = |made: &Numbers, golden: &Numbers| {
+        let names = made.keys().chain(golden.keys()).filter(|name| made.get(*name) != golden.get(*name));
+        names.map(|name| format!("{name}: {:?}, golden {:?}", made.get(name), golden.get(name))).collect::<Vec<_>>()
+    };
+    assert_eq!(differs(&of_header(), &in_c), [""; 0], "coboot.h");
+    let of_records = in_c.iter().filter(|(name, _)| name.contains("of("));
+    let mut rust = of_rust();
+    rust.extend(of_records.map(|(name, number)| (name.clone(), *number)));
+    let golden = in_c.clone().into_iter().chain(others).collect();
+    assert_eq!(differs(&rust, &golden), [""; 0], "shared-abi: {FROZEN}");
     // No line of the two forms was overlooked.
     let assertions = HEADER.matches("\nCOBOOT_STATIC_ASSERT(").count();
     let defines =
         HEADER.lines().filter(|line| line.starts_with("#define") && line.contains("INT32_C(")).count();
-    assert_eq!(header.len(), assertions + defines);
-}
-
-/// The documented values (the check word's are in shared-abi), typed a second time.
-#[test]
-fn what_c_sees_are_the_documented_values() {
-    for line in [
-        "#define COBOOT_CHECK_SEED UINT32_C(0xC0B007A5)",
-        "#define COBOOT_REQUEST_STAY UINT32_C(0x1)",
-        "#define COBOOT_REQUEST_POWER_ON UINT32_C(0x5)",
-        "#define COBOOT_SELECTOR_INVALIDATE UINT32_C(0x6)",
-        "#define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */",
-        "#define COBOOT_REQUEST_OWED UINT32_C(0x7)",
-        "#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)",
-        "    uint32_t date;",
-        "    uint32_t program_date;",
-        "    uint32_t reserved[2];",
-        "#define COBOOT_OTP UINT32_C(0x1FFF7800)",
-        "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
-        "COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
-        "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",
-        "COBOOT_STATIC_ASSERT(offsetof(struct coboot_callgate, entry) == 12, \"coboot_callgate: entry\");",
-    ] {
-        assert!(HEADER.lines().any(|there| there == line), "{line}");
-    }
+    assert_eq!(in_c.len(), assertions + defines);
 }

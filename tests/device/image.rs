@@ -312,7 +312,6 @@ fn damages() -> Vec<(&'static str, Parts, u32)> {
         ("RAM of the handoff", sealed(&[(RAM_END, board.ram.end() + 4)]), BY_HEADER),
         ("RAM that ends before it begins", sealed(&[(RAM_END, 0)]), BY_HEADER),
         ("RAM that is shorter than the image", sealed(&[(RAM_END, board.ram.base + size - 4)]), BY_HEADER),
-        ("a reserved word", sealed(&[(RESERVED, 1)]), BY_HEADER),
         ("newer services", sealed(&[(SERVICES, SERVICES_VERSION + 1)]), BY_SERVICES),
         ("an ability that the resident part has not", sealed(&[(FEATURES, 1)]), BY_SERVICES),
         ("an unknown ability", sealed(&[(FEATURES, 1 << 31)]), BY_SERVICES),

@@ -271,12 +271,11 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, serial_number) == 16, "co
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, reserved) == 20, "coboot_nameplate: reserved");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, check) == 28, "coboot_nameplate: check");
 
-/* Whether a block has a good nameplate. */
+/* Whether a block has a good nameplate. Later ones may give names to the reserved words. */
 static inline bool coboot_nameplate_is_sound(const struct coboot_nameplate *plate)
 {
     const size_t guarded = offsetof(struct coboot_nameplate, check) / sizeof(uint32_t);
-    return plate->magic == COBOOT_NAMEPLATE_MAGIC && plate->reserved[0] == 0 && plate->reserved[1] == 0
-        && plate->check == coboot_check_word(plate, guarded);
+    return plate->magic == COBOOT_NAMEPLATE_MAGIC && plate->check == coboot_check_word(plate, guarded);
 }
 
 /* The nameplate in these COBOOT_OTP_BLOCKS blocks: the last good one, or a null pointer. */

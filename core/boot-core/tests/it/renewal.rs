@@ -355,7 +355,6 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
         ("for newer services", Header { services: SERVICES_VERSION + 1, ..SOUND }, true),
         ("with an unknown ability", Header { features: Abilities(2 | 1 << 7), ..SOUND }, true),
         ("without renewal", Header { features: Abilities::NONE, ..SOUND }, true),
-        ("with a reserved word", Header { reserved: 1, ..SOUND }, true),
         ("for another place in RAM", Header { ram_base: 0x2000_0200, ..SOUND }, true),
         ("of another format", Header { length: 64 | 1 << 16, ..SOUND }, true),
     ] {
