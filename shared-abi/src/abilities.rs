@@ -2,10 +2,10 @@
 
 /// A set of abilities, a bit each: those that an image needs, in its
 /// [header](crate::ram_image::Header::features), and those that the resident part has, in its
-/// [facts](crate::services::Facts::abilities). Both have the same numbers, and no number is used twice.
+/// [facts](crate::services::Facts::abilities), which have the lower half.
 ///
 /// An ability that the reader does not know means "needs more than I have" in a header: the image is refused. In
-/// the facts it means "has more than I need", and is ignored. A bit that stands for nothing yet is written 0.
+/// the facts it means "has more than I need", and is ignored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(transparent)]
 pub struct Abilities(pub u32);

@@ -8,7 +8,8 @@
 /// Identifies a callgate table ("CBCG" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBCG");
 
-/// Version of the ABI. A new selector does not change it; a changed meaning increases it.
+/// Version of the ABI. It has not changed since the first bootloader: a new selector does not change it,
+/// because an older bootloader answers [`Status::UnknownSelector`], and no meaning changes.
 pub const ABI_VERSION: u16 = 1;
 
 /// The size of the table in flash in bytes.
@@ -29,7 +30,7 @@ pub struct Table<E = u32> {
     pub magic: u32,
     /// [`ABI_VERSION`].
     pub abi_version: u16,
-    /// The size of the table in bytes: it shows an application whether a later field exists.
+    /// The size of the table in bytes: 16, because the [services](crate::services) follow it.
     pub length: u16,
     /// Version of the bootloader: major in the upper half, minor in the lower.
     pub bootloader_version: u32,
@@ -167,6 +168,3 @@ pub enum CallgateError {
     /// The bootloader refused with this code. [`Status`] names the codes of this version.
     Refused(i32),
 }
-
-#[cfg(test)]
-mod tests;

@@ -10,8 +10,7 @@ use crate::check_word;
 /// Identifies a handoff ("CBHO" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 
-/// The version of this record's layout. Later versions only define reserved words, which were 0
-/// before, so a reader accepts every version from [`OLDEST`] on.
+/// The version of the record; a reader takes every one from [`OLDEST`] on.
 ///
 /// | version | new fields |
 /// |---|---|
@@ -317,89 +316,6 @@ const fn is_sound(words: &[u32; WORDS]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const INFO: BootInfo = BootInfo {
-        node_id: 5,
-        bit_rate: 125_000,
-        program: 1,
-        reset_cause: ResetCause::Software,
-        trial: true,
-        fresh: true,
-        bootloader_version: 0x0001_0002,
-        serial_number: 0xDEAD_BEEF,
-        bootloader_number: Some(2),
-        sdo: SdoBases { request: 0x680, response: 0x480 },
-        program_date: 1_795_804_215,
-        nameplate: true,
-    };
-
-    #[test]
-    fn tells_what_it_was_told() {
-        assert_eq!(Handoff::new(&INFO).info(), Some(INFO));
-        let predefined = BootInfo { sdo: SdoBases::PREDEFINED, ..INFO };
-        assert_eq!(Handoff::new(&predefined).info(), Some(predefined));
-        assert_eq!(Handoff::new(&predefined).sdo_request_base, 0, "as before version 4");
-    }
-
-    /// A bootloader of version 1 does not set these flags, no number, no COB-IDs and no date; a newer one may set
-    /// unknown bits, a number that none can be, and COB-IDs of other services.
-    #[test]
-    fn an_older_version_is_read_and_is_never_fresh() {
-        let mut words = [0; WORDS];
-        words[..6].copy_from_slice(&[MAGIC, 0x0030_0001, 0x0103_0105, 125_000, 0x0001_0002, 0xDEAD_BEEF]);
-        words[WORDS - 1] = check_of(&words);
-        // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
-        let old: Handoff = unsafe { core::mem::transmute(words) };
-        let sdo = SdoBases::PREDEFINED;
-        let (nameplate, program_date) = (false, 0);
-        let expected =
-            Some(BootInfo { fresh: false, bootloader_number: None, sdo, nameplate, program_date, ..INFO });
-        assert_eq!(old.info(), expected);
-        words[1] = 0x0030_0006;
-        words[6] = 0xFFFF_FFFC;
-        words[7] = 0x0102;
-        words[8] = 0x0480_0000;
-        words[WORDS - 1] = check_of(&words);
-        // SAFETY: as above.
-        let newer: Handoff = unsafe { core::mem::transmute(words) };
-        assert_eq!(newer.info(), expected);
-    }
-
-    #[test]
-    fn any_damage_is_seen() {
-        let good = Handoff::new(&INFO);
-        assert_eq!(Handoff { node_id: 6, ..good }.info(), None);
-        assert_eq!(Handoff { trial: 0, ..good }.info(), None);
-        assert_eq!(Handoff { flags: 0, ..good }.info(), None);
-        assert_eq!(Handoff { bootloader_number: 3, ..good }.info(), None);
-        assert_eq!(Handoff { sdo_response_base: 0x580, ..good }.info(), None);
-        assert_eq!(Handoff { program_date: 0, ..good }.info(), None);
-        assert_eq!(Handoff { reserved: 1, ..good }.info(), None);
-        assert_eq!(Handoff { check: !good.check, ..good }.info(), None);
-        let unusable = Handoff::new(&BootInfo { node_id: 0, ..INFO });
-        assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");
-    }
-
-    /// The numbers that a program in C uses (coboot.h).
-    #[test]
-    fn each_cause_has_its_number() {
-        use ResetCause::*;
-        let causes = [
-            Unknown,
-            PowerOn,
-            Pin,
-            Software,
-            IndependentWatchdog,
-            WindowWatchdog,
-            LowPower,
-            BrownOut,
-            Standby,
-            Unknown,
-        ];
-        for (byte, cause) in (0..).zip(causes) {
-            assert_eq!(ResetCause::from_byte(byte), cause, "{byte}");
-        }
-    }
 
     /// Flag positions from RM0090 section 7.3.21.
     #[test]

@@ -24,9 +24,44 @@
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
 //! | [`block_file`] | the format of the data for object 1F50h |
 //!
-//! Everything that two images exchange is `repr(C)`, little-endian and versioned. This crate has no
-//! dependencies, so that an application in C or with a foreign tool chain can easily be compared
-//! with it.
+//! This crate has no dependencies, so that an application in C or with a foreign tool chain can easily
+//! be compared with it.
+//!
+//! # Records that stay for ever
+//!
+//! The resident part of a device never changes: it meets applications and RAM images of the next ten years, and
+//! they meet resident parts of ten years ago. `tests/abi` has a golden copy of what they exchange.
+//!
+//! - A record has integers alone, little-endian, `repr(C)`, without gaps.
+//! - A number (a request, a key, an ability, a reason) keeps its meaning, and is never used for another one.
+//! - **A record grows at its end**: by fields after the last one if it says its size; otherwise by its reserved
+//!   words and bits, first to last, and its size stays. **Reserved is written 0 and ignored when read**, so that 0
+//!   in a later field means "as before".
+//! - A version counts what was added. A reader takes every later one.
+//! - What an older reader must not ignore is no reserved field: it is an ability that the header of a RAM image
+//!   needs, or the record gets another magic, and is none to that reader.
+//! - Zeros, ones, and a record with a wrong check word are no record.
+//!
+//! | record | from → to | bytes | grows by | smaller, larger | what its reader does not know |
+//! |---|---|---|---|---|---|
+//! | [`warm_start`] | application, RAM image → resident part | 16 | requests | – | no request: a crash |
+//! | [`handoff`] | resident part → application | 48 | flags, 1 word | none | a flag is ignored, a cause is *unknown* |
+//! | [`boot_report`] | resident part → RAM image | 48 | 4 words | none | a reason is shown, an origin is *home*, an end *none* |
+//! | [`callgate`] | resident part → application | 16: the services follow | selectors | none, read | a selector: status −1; a status is a failure |
+//! | its arguments | application ↔ resident part | each its own | – | – | a flag is ignored |
+//! | [`services`] | resident part → RAM image | its `size` | entries | refused, read | a step or a result is *failed* |
+//! | [`Facts`](services::Facts) | resident part → build, tools, RAM image | ≥ 20 | fields | none, read | an [ability](abilities::Abilities) is ignored |
+//! | [`ram_image`] | build → resident part, RAM image | 64 | 1 word | refused | an [ability](abilities::Abilities) is refused |
+//! | [`nameplate`] | production → resident part, application | 32 | 2 words | – | – |
+//! | [`label`] | application → bootloader, tools | 32 | 2 words | – | – |
+//! | journal (`boot_core::store`) | resident part, RAM image → the same | 28 each | keys | – | a key is kept; a release or a state is none |
+//! | key block (`seal::key_block`) | production → bootloader | 256 | flags, 56 bytes | – | a flag is ignored |
+//!
+//! An image is for the resident parts with one record of facts, whose CRC is in its header: another ability, or a
+//! field more, makes other facts. Kept for files that an application stores, and installs later: request 15 with
+//! the number of a program, the ability [`INSTALL`](abilities::Abilities::INSTALL), and the keys 0008xxxxh (the
+//! installation) and 0009xxxxh (the kept file) of each program. **To a resident part without the ability, request
+//! 15 is none, and counts as a crash: nobody sends it there.** An application finds the ability in the facts.
 #![no_std]
 
 pub mod abilities;

@@ -268,11 +268,4 @@ mod tests {
             assert_eq!(entry(sp, reset), Err(Damage::Vectors), "{sp:08X} {reset:08X}");
         }
     }
-
-    #[test]
-    fn the_header_has_64_bytes() {
-        assert_eq!(size_of::<Header>(), 64);
-        assert_eq!(core::mem::offset_of!(Header, board), 32);
-        assert_eq!(core::mem::offset_of!(Header, facts), 56);
-    }
 }

@@ -2,8 +2,8 @@
 //! non-volatile data.
 //!
 //! The table follows the callgate's at its fixed address. Everything in it is an integer, or a
-//! pointer to integers, so no side can give the other a value that its types do not know. The table
-//! only grows: an entry is never changed or removed, and the version counts the additions. A RAM
+//! pointer to integers, so no side can give the other a value that its types do not know. An entry is
+//! never changed or removed, nor what it gives: a new kind of operation needs a new entry. A RAM
 //! image needs at least a version ([`Header::services`](crate::ram_image::Header::services)); the
 //! resident part does not start an image that needs more.
 //!
@@ -202,82 +202,3 @@ pub struct StoreState(pub [u32; STORE_STATE_WORDS]);
 /// Words of [`StoreState`]: enough for the journal. It never changes: a store of a product's own that
 /// needs more keeps it elsewhere.
 pub const STORE_STATE_WORDS: usize = 32;
-
-// The table as the resident parts in the field have it: eight more bytes for each entry where a
-// pointer has eight.
-const _: () = {
-    use core::mem::offset_of;
-    const POINTER: usize = size_of::<usize>();
-    assert!(offset_of!(Services, version) == 0 && offset_of!(Services, size) == 4);
-    assert!(offset_of!(Services, open) == 8);
-    assert!(offset_of!(Services, get) == 8 + POINTER);
-    assert!(offset_of!(Services, store) == 8 + 2 * POINTER);
-    assert!(offset_of!(Services, next) == 8 + 3 * POINTER);
-    assert!(offset_of!(Services, crc32) == 8 + 4 * POINTER);
-    assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
-    assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
-    assert!(offset_of!(Services, facts) == 8 + 7 * POINTER);
-    assert!(offset_of!(Services, compact) == 8 + 8 * POINTER);
-    assert!(offset_of!(Facts, bit_rates) == 12 && size_of::<Facts>() == 20);
-    assert!(size_of::<StoreState>() == 128);
-};
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_result_that_nobody_knows_is_a_failure() {
-        use OperationResult::{Done, Failed, NotVerified, Protected};
-        for result in [Done, Protected, Failed, NotVerified] {
-            assert_eq!(OperationResult::from_number(result as u32), result);
-        }
-        assert_eq!([4, u32::MAX].map(OperationResult::from_number), [Failed; 2]);
-    }
-
-    #[test]
-    fn facts_are_read_from_the_bytes_of_a_resident_part() {
-        let facts = Facts {
-            board: 0x1234_5678,
-            size: 20,
-            autostart: 2,
-            crc_bits: 16,
-            node_ids: 0x7F01,
-            bit_rates: 0x1FF,
-            abilities: 0x8001,
-            sdo_request_base: 0x680,
-            sdo_response_base: 0x480,
-        };
-        // Its services are at 20h, version 3, and the facts at 60h.
-        let mut bytes = [0; 0x80];
-        for (at, word) in [
-            (0x20, 3),
-            (0x44, 0x0800_0060),
-            (0x60, 0x1234_5678),
-            (0x64, 0x0002_0014),
-            (0x68, 0x7F01_0010),
-            (0x6C, 0x8001_01FF),
-            (0x70, 0x0480_0680),
-        ] {
-            bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
-        }
-        let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
-        assert_eq!(read(&bytes), Some((3, facts)));
-        assert_eq!(Facts::record(&bytes, 0x0800_0000, 0x0800_0020), Some(&bytes[0x60..0x74]));
-        for (at, word) in [(0x44, 0x0800_0070_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_0013)] {
-            let mut wrong = bytes;
-            wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());
-            assert_eq!(read(&wrong), None, "{word:#x} at {at:#x}");
-        }
-        assert_eq!(read(&bytes[..0x40]), None);
-        assert_eq!(read(&[]), None);
-    }
-
-    #[test]
-    fn a_step_that_nobody_knows_is_a_failure() {
-        for step in [Step::Start, Step::Again, Step::Done, Step::Failed] {
-            assert_eq!(Step::from_number(step as u32), step);
-        }
-        assert_eq!([4, u32::MAX].map(Step::from_number), [Step::Failed; 2]);
-    }
-}

@@ -24,7 +24,8 @@ use shared_abi::services::{Facts, Services};
 use shared_abi::warm_start::{BootRequest, Damage, Owed, StoredNode, TrialStep, WarmStart};
 
 /// What a test says about a change.
-pub const FROZEN: &str = "images and devices in the field have it as it was. A new field goes to the end, or into a \
+pub const FROZEN: &str =
+    "images and devices in the field have it as it was. A new field goes to the end, or into a \
                           reserved word; a new number is the next that is free (shared-abi/src/lib.rs)";
 
 /// A record of the golden copy.
@@ -129,9 +130,13 @@ pub fn read(record: &str, bytes: &[u8]) -> String {
         ("warm-start cell", _) => format!("{:?}", of_bytes::<WarmStart>(bytes).request()),
         ("handoff", _) => format!("{:?}", of_bytes::<Handoff>(bytes).info()),
         ("boot report", _) => {
-            let seen = |report: BootReport| (report, Reason::from_byte(report.reason), of_word(report.renewal));
+            let seen =
+                |report: BootReport| (report, Reason::from_byte(report.reason), of_word(report.renewal));
             let report = BootReport::parse(&of_bytes(bytes)).map(seen);
-            format!("{:?}", report.map(|(report, reason, end)| (BootReport { renewal: 0, ..report }, reason, end)))
+            format!(
+                "{:?}",
+                report.map(|(report, reason, end)| (BootReport { renewal: 0, ..report }, reason, end))
+            )
         }
         ("nameplate", _) => {
             let plate = Nameplate::parse(&of_bytes(bytes));
@@ -233,6 +238,9 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         nameplate: true,
     };
     add("handoff", bytes(&Handoff::new(&info)), some(&info));
+    let info = BootInfo { trial: false, fresh: false, nameplate: false, bootloader_number: None, ..info };
+    let info = BootInfo { sdo: SdoBases::PREDEFINED, program_date: 0, bit_rate: 0, ..info };
+    add("handoff: least", bytes(&Handoff::new(&info)), some(&info));
     let report = BootReport {
         reason: 14,
         held_program: 2,
@@ -334,8 +342,16 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
     for (name, number, record) in [
         ("released and confirmed", 1, plain),
         ("released", 1, ProgramRecord { confirmed: false, ..plain }),
-        ("confirmed, sealed and withdrawn", 254, ProgramRecord { half_erased: true, withdrawn: true, ..sealed }),
-        ("sealed and writing", 2, ProgramRecord { confirmed: false, seal: Some(Seal::WritesFlash), ..sealed }),
+        (
+            "confirmed, sealed and withdrawn",
+            254,
+            ProgramRecord { half_erased: true, withdrawn: true, ..sealed },
+        ),
+        (
+            "sealed and writing",
+            2,
+            ProgramRecord { confirmed: false, seal: Some(Seal::WritesFlash), ..sealed },
+        ),
     ] {
         let [_, made] = journal(Key::program(number), record.value());
         add(&format!("journal: program, {name}"), made, format!("{:?}", (Some(record), [0_u32; 2])));

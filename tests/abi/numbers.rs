@@ -34,7 +34,12 @@ fn frozen() -> [Numbers; 2] {
     for record in golden() {
         let Some(structure) = record.structure else { continue };
         in_c.insert(format!("sizeof(struct {structure})"), record.bytes.len() as i64);
-        in_c.extend(record.fields.iter().map(|(field, at)| (format!("offsetof(struct {structure}, {field})"), *at as i64)));
+        in_c.extend(
+            record
+                .fields
+                .iter()
+                .map(|(field, at)| (format!("offsetof(struct {structure}, {field})"), *at as i64)),
+        );
     }
     [in_c, others.lines().filter_map(number).collect()]
 }
@@ -71,7 +76,7 @@ fn known<T: Debug>(prefix: &str, of: impl Fn(u8) -> Option<T>) -> Vec<(String, i
     (0..=u8::MAX).filter_map(|number| Some((name(of(number)?), number.into()))).collect()
 }
 
-/// Those of `shared-abi`, and of the journal. A number that a reader takes for another one is not known to it.
+/// Those of `shared-abi`, and of the journal.
 fn of_rust() -> Numbers {
     let mut all: Numbers = [
         ("CHECK_SEED", shared_abi::CHECK_SEED),
@@ -119,34 +124,23 @@ fn of_rust() -> Numbers {
         request(0).or(request(1)).filter(|it| WarmStart::new(*it).request == number.into())
     };
     all.extend(known("REQUEST", request));
-    all.extend(known("DAMAGE", |number| Damage::from_number(number).filter(|it| *it as u8 == number)));
-    all.extend(known("TRIAL_STEP", |number| TrialStep::from_number(number).filter(|it| *it as u8 == number)));
-    all.extend(known("REASON", |number| Reason::from_byte(number).filter(|it| *it as u8 == number)));
-    all.extend(known("RESET", |number| Some(ResetCause::from_byte(number)).filter(|it| *it as u8 == number)));
-    all.extend(known("ORIGIN", |number| Some(Origin::from_byte(number)).filter(|it| *it as u8 == number)));
-    all.extend(known("SELECTOR", |number| {
-        Selector::from_number(number.into()).filter(|it| *it as u32 == number.into())
-    }));
-    all.extend(known("RESULT", |number| {
-        Some(OperationResult::from_number(number.into())).filter(|it| *it as u32 == number.into())
-    }));
-    all.extend(known("STEP", |number| {
-        Some(Step::from_number(number.into())).filter(|it| *it as u32 == number.into())
-    }));
-    for status in [
-        Status::Ok,
-        Status::UnknownSelector,
-        Status::BadPointer,
-        Status::BadRange,
-        Status::Busy,
-        Status::Failed,
-        Status::BadArgument,
-        Status::NoProgram,
-        Status::Locked,
-        Status::Full,
-    ] {
-        let [(name, _)] = &known("STATUS", |number| (number == 0).then_some(status))[..] else { unreachable!() };
-        all.insert(name.clone(), (status as i32).into());
+    all.extend(known("DAMAGE", Damage::from_number));
+    all.extend(known("TRIAL_STEP", TrialStep::from_number));
+    all.extend(known("REASON", Reason::from_byte));
+    all.extend(known("SELECTOR", |number| Selector::from_number(number.into())));
+    // These take a number that they do not know for another one.
+    all.extend(known("RESET", |byte| Some(ResetCause::from_byte(byte)).filter(|it| *it as u8 == byte)));
+    all.extend(known("ORIGIN", |byte| Some(Origin::from_byte(byte)).filter(|it| *it as u8 == byte)));
+    let result = |number: u8| OperationResult::from_number(number.into());
+    all.extend(known("RESULT", |number| Some(result(number)).filter(|it| *it as u8 == number)));
+    let step = |number: u8| Step::from_number(number.into());
+    all.extend(known("STEP", |number| Some(step(number)).filter(|it| *it as u8 == number)));
+    use Status::*;
+    for status in
+        [Ok, UnknownSelector, BadPointer, BadRange, Busy, Failed, BadArgument, NoProgram, Locked, Full]
+    {
+        let name = known("STATUS", |number| (number == 0).then_some(status)).remove(0).0;
+        all.insert(name, (status as i32).into());
     }
     all
 }
@@ -156,7 +150,9 @@ fn every_number_is_the_golden_one_in_rust_and_in_c() {
     let [in_c, others] = frozen();
     let differs = |made: &Numbers, golden: &Numbers| {
         let names = made.keys().chain(golden.keys()).filter(|name| made.get(*name) != golden.get(*name));
-        names.map(|name| format!("{name}: {:?}, golden {:?}", made.get(name), golden.get(name))).collect::<Vec<_>>()
+        names
+            .map(|name| format!("{name}: {:?}, golden {:?}", made.get(name), golden.get(name)))
+            .collect::<Vec<_>>()
     };
     assert_eq!(differs(&of_header(), &in_c), [""; 0], "coboot.h");
     let of_records = in_c.iter().filter(|(name, _)| name.contains("of("));

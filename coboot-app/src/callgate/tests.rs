@@ -71,19 +71,6 @@ fn gate() -> Callgate<Entry> {
 }
 
 #[test]
-fn tells_absence_from_another_version() {
-    assert_eq!(Callgate::check(GOOD).unwrap().bootloader_version(), 0x0001_0000);
-    let erased = Table { magic: u32::MAX, abi_version: u16::MAX, length: u16::MAX, ..GOOD };
-    assert_eq!(Callgate::check(erased).unwrap_err(), CallgateError::Absent);
-    assert_eq!(Callgate::check(Table { length: 12, ..GOOD }).unwrap_err(), CallgateError::Absent);
-    assert_eq!(Callgate::check(Table { abi_version: 0, ..GOOD }).unwrap_err(), CallgateError::Version(0));
-    assert!(Callgate::check(Table { abi_version: 2, ..GOOD }).is_ok(), "a newer one only has more");
-    assert_eq!(Callgate::check(Table { magic: 0, ..GOOD }).unwrap_err(), CallgateError::Absent);
-    // A later bootloader of this version may have a longer table.
-    assert!(Callgate::check(Table { length: 20, ..GOOD }).is_ok());
-}
-
-#[test]
 fn each_service_passes_its_arguments_and_returns_its_results() {
     let gate = gate();
     assert_eq!(gate.crc32(0x0801_0000, 9), Ok(0xCBF4_3926));

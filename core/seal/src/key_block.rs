@@ -12,7 +12,7 @@
 //! | 12 | 4 | the lowest epoch |
 //! | 16 | 2 × 36 | roots: id, public key; unused ones are 0 |
 //! | 88 | 3 × 36 | key-encryption keys: id, key; unused ones are 0 |
-//! | 196 | 56 | 0 |
+//! | 196 | 56 | reserved: 0, and ignored when read |
 //! | 252 | 4 | CRC-32 of all before |
 
 /// Bytes of a key block.

@@ -91,7 +91,7 @@ extern const struct coboot_label coboot_label_of_image;
 /* Requests. Those for a program take its number, 1 to 254, as argument, an owed answer what coboot_owed makes, node
  * parameters what coboot_stored_node makes, and the others 0. Confirm, invalidate and store node
  * are for what the callgate answers with COBOOT_STATUS_LOCKED. Rescue starts as after a power-on,
- * with the rescue window. */
+ * with the rescue window. A bootloader that does not know a request counts a crash: send no others. */
 #define COBOOT_REQUEST_STAY UINT32_C(0x1)
 #define COBOOT_REQUEST_TRIAL UINT32_C(0x2)
 #define COBOOT_REQUEST_START UINT32_C(0x3)

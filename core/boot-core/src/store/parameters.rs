@@ -5,7 +5,8 @@ use shared_abi::ram_image::SERVICES_VERSION;
 use crate::flash::{Flash, FlashFault, Next};
 
 /// The key of a stored value: a word, in flash and between the parts of the bootloader. A part that
-/// does not know a key keeps its value. FFFFFFFFh (erased flash) is no key.
+/// does not know a key keeps its value. FFFFFFFFh (erased flash) is no key; 0008xxxxh and 0009xxxxh are
+/// kept (`shared_abi`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(transparent)]
 pub struct Key(pub u32);
