@@ -24,9 +24,8 @@ use shared_abi::services::{Facts, Services};
 use shared_abi::warm_start::{BootRequest, Damage, Owed, StoredNode, TrialStep, WarmStart};
 
 /// What a test says about a change.
-pub const FROZEN: &str =
-    "images and devices in the field have it as it was. A new field goes to the end, or into a \
-                          reserved word; a new number is the next that is free (shared-abi/src/lib.rs)";
+pub const FROZEN: &str = "images and devices in the field have it as it was: a new field goes to the end or into a \
+    reserved word, a new number is the next free one (shared-abi/src/lib.rs), and the golden copy gets it, too";
 
 /// A record of the golden copy.
 pub struct Golden {
@@ -130,13 +129,10 @@ pub fn read(record: &str, bytes: &[u8]) -> String {
         ("warm-start cell", _) => format!("{:?}", of_bytes::<WarmStart>(bytes).request()),
         ("handoff", _) => format!("{:?}", of_bytes::<Handoff>(bytes).info()),
         ("boot report", _) => {
-            let seen =
-                |report: BootReport| (report, Reason::from_byte(report.reason), of_word(report.renewal));
-            let report = BootReport::parse(&of_bytes(bytes)).map(seen);
-            format!(
-                "{:?}",
-                report.map(|(report, reason, end)| (BootReport { renewal: 0, ..report }, reason, end))
-            )
+            let seen = BootReport::parse(&of_bytes(bytes)).map(|it| {
+                (BootReport { renewal: 0, ..it }, Reason::from_byte(it.reason), of_word(it.renewal))
+            });
+            format!("{seen:?}")
         }
         ("nameplate", _) => {
             let plate = Nameplate::parse(&of_bytes(bytes));

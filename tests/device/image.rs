@@ -595,10 +595,16 @@ fn an_image_takes_longer_tables_than_it_knows() {
     let mut longer = good.clone();
     longer.resident[table..][..4].copy_from_slice(&(SERVICES_VERSION + 7).to_le_bytes());
     longer.resident[table + 4..][..4].copy_from_slice(&64_u32.to_le_bytes());
-    let mut older = good;
-    older.set(SERVICES, 0);
-    older.seal();
-    for (what, parts) in [("a newer resident part", longer), ("an older image", older)] {
+    let with = |word, value| {
+        let mut parts = good.clone();
+        parts.set(word, value);
+        parts.seal();
+        parts
+    };
+    let (older, newer) = (with(SERVICES, 0), with(RESERVED, 1));
+    for (what, parts) in
+        [("a newer resident part", longer), ("an older image", older), ("a later header", newer)]
+    {
         let mut bench = Bench::new();
         load(&mut bench, &parts);
         bench.power_on();
