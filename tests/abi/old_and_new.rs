@@ -42,7 +42,6 @@ const ROWS: &[Row] = &[
     // ability.
     (CELL, "a request of the future", &[(4, 17)], Is("None")),
     (CELL, "install, which no resident part has", &[(4, 15), (8, 1)], Is("None")),
-    (CELL, "the highest request", &[(4, !0)], Is("None")),
     (CELL, "more in the argument", &[(8, 0x017F_0302)], Is("None")),
     (CELL, "a damage of the future", &[(4, 8), (8, 7)], Is("None")),
     (CELL, "a step of a trial of the future", &[(4, 13), (8, 4)], Is("None")),
@@ -102,6 +101,7 @@ const ROWS: &[Row] = &[
     (SERVICES, "smaller facts", &[(48, 0x0201_0013)], Is("None")),
     (SERVICES, "no facts", &[(36, 0)], Is("None")),
     (SERVICES, "facts outside of it", &[(36, 0x0900_0000)], Is("None")),
+    (SERVICES, "facts over its end", &[(36, 0x0800_03F0)], Is("None")),
 
     (JOURNAL, "an older format", &[(12, 0)], Same),
     (JOURNAL, "a newer format", &[(12, 2)], Is("None")),
