@@ -24,22 +24,21 @@
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
 //! | [`block_file`] | the format of the data for object 1F50h |
 //!
-//! This crate has no dependencies, so that an application in C or with a foreign tool chain can easily
-//! be compared with it.
+//! This crate has no dependencies, so that an application in C or with a foreign tool chain can
+//! easily be compared with it.
 //!
 //! # Records that stay for ever
 //!
-//! The resident part of a device never changes: it meets applications and RAM images of the next ten years, and
-//! they meet resident parts of ten years ago. `tests/abi` has a golden copy of what they exchange.
+//! The resident part of a device never changes: it meets the applications and RAM images of the next
+//! ten years, and they meet it. `tests/abi` has a golden copy of all that they exchange.
 //!
 //! - A record has integers alone, little-endian, `repr(C)`, without gaps.
-//! - A number (a request, a key, an ability, a reason) keeps its meaning, and is never used for another one.
-//! - **A record grows at its end**: by fields after the last one if it says its size; otherwise by its reserved
-//!   words and bits, first to last, and its size stays. **Reserved is written 0 and ignored when read**, so that 0
-//!   in a later field means "as before".
-//! - A version counts what was added. A reader takes every later one.
-//! - What an older reader must not ignore is no reserved field: it is an ability that the header of a RAM image
-//!   needs, or the record gets another magic, and is none to that reader.
+//! - A number (of a request, a key, an ability, a reason) keeps its meaning; none is used twice.
+//! - **A record grows at its end**: by fields, if it says its size; otherwise by its reserved words
+//!   and bits, first to last. **Reserved is written 0 and ignored when read**: 0 in a later field means
+//!   "as before". A version counts the additions, and a reader takes every later one.
+//! - What an older reader must not ignore is an ability that the header of a RAM image needs; or the
+//!   record gets another magic, and is none to that reader.
 //! - Zeros, ones, and a record with a wrong check word are no record.
 //!
 //! | record | from → to | bytes | grows by | smaller, larger | what its reader does not know |
@@ -57,11 +56,11 @@
 //! | journal (`boot_core::store`) | resident part, RAM image → the same | 28 each | keys | – | a key is kept; a release or a state is none |
 //! | key block (`seal::key_block`) | production → bootloader | 256 | flags, 56 bytes | – | a flag is ignored |
 //!
-//! An image is for the resident parts with one record of facts, whose CRC is in its header: another ability, or a
-//! field more, makes other facts. Kept for files that an application stores, and installs later: request 15 with
-//! the number of a program, the ability [`INSTALL`](abilities::Abilities::INSTALL), and the keys 0008xxxxh (the
-//! installation) and 0009xxxxh (the kept file) of each program. **To a resident part without the ability, request
-//! 15 is none, and counts as a crash: nobody sends it there.** An application finds the ability in the facts.
+//! The header of an image has the CRC of the facts that it is for: one more ability, or field, makes
+//! other facts. **Kept** for files that an application stores, to be installed later: request 15 with
+//! the number of the program, [`INSTALL`](abilities::Abilities::INSTALL), which the application finds
+//! in the facts, and the keys 0008xxxxh (the installation) and 0009xxxxh (the kept file). To a
+//! resident part without the ability request 15 is none, and counts as a crash: nobody sends it there.
 #![no_std]
 
 pub mod abilities;

@@ -175,8 +175,7 @@ pub struct WarmStart {
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged, 9
     /// fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the
     /// ROM, 16 as after a power-on with a rescue window; 0 none, which may have the mark. 15 is kept
-    /// for the installation of a stored program, whose number will be the argument: nobody sends it to a
-    /// resident part without [`INSTALL`](crate::abilities::Abilities::INSTALL), to which it is a crash.
+    /// for the installation of a stored program ([the rules](crate#records-that-stay-for-ever)).
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,

@@ -13,8 +13,8 @@ use shared_abi::nameplate::Nameplate;
 use crate::layout::{golden, named, of_bytes};
 use crate::old_and_new::records;
 
-/// A program in C and C++ that prints the label and the arguments that the header makes; and of each record that comes
-/// in, as bytes, what the header's functions make of it.
+/// A program in C and C++ that prints the label and the arguments that the header makes; and what its
+/// functions make of each record that comes in, as bytes.
 const PROGRAM: &str = r#"
 #include <stdio.h>
 #include <stdlib.h>
@@ -168,7 +168,7 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
             add(kind.chars().next().unwrap(), &bytes, in_rust(kind, &bytes));
         }
     }
-    // The last good one counts: that in block 9, after one in block 2, and before a damaged one in block 15.
+    // The last good one counts: after one in block 2, and before a damaged one in block 15.
     let mut otp = vec![0xFF; 512];
     for (block, serial_number) in [(2, 1), (9, 2), (15, 3)] {
         let plate = Nameplate::new(7, 8, 9, serial_number).words();

@@ -1,5 +1,5 @@
-//! The records of the ABI, byte for byte: what is written today is the golden copy `records.txt`, and reads as what
-//! was written. And the memory map.
+//! The records of the ABI, byte for byte: what is written today is the golden copy `records.txt`, and
+//! reads as what was written. And the memory map.
 
 use std::mem::{offset_of, size_of};
 use std::sync::LazyLock;
@@ -64,7 +64,7 @@ fn record(section: &'static str) -> Golden {
 /// The bytes of a structure in RAM. (The host is little-endian, like the chip.)
 fn bytes<T: Copy>(value: &T) -> Vec<u8> {
     const { assert!(cfg!(target_endian = "little")) };
-    // SAFETY: `T` is one of the ABI's `repr(C)` structures without padding: they have the size of the golden copy.
+    // SAFETY: `T` is one of the ABI's `repr(C)` structures: they have the size of the golden copy.
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast(), size_of::<T>()) }.to_vec()
 }
 
@@ -192,7 +192,7 @@ pub fn named(name: &str) -> &'static Golden {
     golden().iter().find(|record| record.name == name).unwrap_or_else(|| panic!("no {name}"))
 }
 
-/// What writes each record today, from the values of the golden copy, and what its reader sees then.
+/// Each record as it is written today, from the golden values, and what its reader sees then.
 fn written() -> Vec<(String, Vec<u8>, String)> {
     let some = |value: &dyn std::fmt::Debug| format!("Some({value:?})");
     let mut all = Vec::new();

@@ -1,6 +1,5 @@
-//! The numbers of the ABI: those of `shared-abi` are the golden copy `numbers.txt`, and coboot.h, the C header, has
-//! the same, with the offsets of `records.txt`. (Its assertions hold the layout of the structures against these
-//! when a C compiler reads it.)
+//! The numbers of the ABI: `shared-abi` and coboot.h, the C header, have those of the golden copy
+//! `numbers.txt`, and coboot.h the offsets of `records.txt`. (A C compiler proves them by its assertions.)
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -60,7 +59,7 @@ fn of_header() -> Numbers {
     HEADER.lines().filter_map(entry).collect()
 }
 
-/// All numbers that a reader knows, with their names as in C. A number that it takes for another one is not known.
+/// All numbers that a reader knows, with their names as in C: not those that it takes for another.
 fn known<T: Copy + Debug>(
     prefix: &str,
     of: impl Fn(u8) -> Option<T>,

@@ -1,5 +1,5 @@
-//! Old and new records against each other: what a reader of today makes of a record of before, of one of the
-//! future, and of noise. The rules are those on the page of `shared-abi`.
+//! What a reader of today makes of an older record, of one of the future, and of noise. The rules are
+//! those on the page of `shared-abi`.
 
 use shared_abi::check_word;
 
@@ -16,7 +16,7 @@ enum Seen {
 }
 use Seen::{But, Is, Same};
 
-/// A record of the golden copy, what is else in it, the words that are changed, and what its reader makes of it.
+/// A golden record, what is else in it, the words that are changed, and what its reader makes of it.
 type Row = (&'static str, &'static str, &'static [(usize, u32)], Seen);
 
 const CELL: &str = "warm-start cell: answer owed";
@@ -38,8 +38,7 @@ const FIRST_HANDOFF: &[(&str, &str)] = &[
 
 #[rustfmt::skip]
 const ROWS: &[Row] = &[
-    // No request: the boot stage counts a crash if a program ran. So nobody sends 15 to a resident part without the
-    // ability.
+    // No request: the boot stage counts a crash.
     (CELL, "a request of the future", &[(4, 17)], Is("None")),
     (CELL, "install, which no resident part has", &[(4, 15), (8, 1)], Is("None")),
     (CELL, "more in the argument", &[(8, 0x017F_0302)], Is("None")),
