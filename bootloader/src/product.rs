@@ -546,6 +546,11 @@ impl Product {
             rescue_window_ms: self.rescue_window_ms,
             rescue_window_confirmed_ms: self.rescue_window_confirmed_ms,
             start_allowed: self.start_allowed,
+            two_resets: self.two_resets,
+            renewal: self.renewal,
+            sealed: SEALED,
+            layout: LAYOUT,
+            crc: self.crc,
         }
     }
 }
@@ -646,6 +651,16 @@ const fn first_two(list: &[u8]) -> [u8; 2] {
 
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
+
+/// This product, for the boot stage.
+#[derive(Clone, Copy)]
+pub struct Chosen;
+
+impl decision::Product for Chosen {
+    fn policy(&self) -> &decision::Policy {
+        const { &PRODUCT.decision() }
+    }
+}
 
 /// The values for a renewal of the bootloader in a device of this identity.
 pub const fn renewal(device: &Nameplate) -> Renewal {

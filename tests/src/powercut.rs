@@ -17,6 +17,6 @@ mod point;
 mod points;
 mod scenario;
 
-pub use device::{Bug, DECISION};
+pub use device::{exit, Bug};
 pub use points::{reproduce, run, shows, Cuts, Point, Report, Shown};
 pub use scenario::{Scenario, SCENARIOS};

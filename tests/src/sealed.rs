@@ -8,7 +8,7 @@ use boot_core::canopen::od::Address;
 use boot_core::canopen::{AbortCode, Instant};
 use boot_core::control::SealedMemory;
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, BootDecision, Circumstances};
+use boot_core::decision::{Exit, Start};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use coflash_core::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
@@ -17,7 +17,7 @@ use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
 use shared_abi::geometry::Region;
 use shared_abi::warm_start::BootRequest;
 
-use crate::powercut::DECISION;
+use crate::powercut::exit;
 use kit::boot::Boot;
 use kit::model::{Chip, ModelFlash, CHIP};
 use kit::rig::{go_on, program, Node, BOARD_NODE};
@@ -320,11 +320,9 @@ impl Device {
     /// The program that the boot stage starts.
     #[must_use]
     pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
-        let circumstances =
-            Circumstances { request, strap: false, crash_resets: 0, node_id: 5, nearly_full: false };
-        match decide(&circumstances, &DECISION, |program| self.verified(program)) {
-            BootDecision::Start { program, .. } => Some(program.number()),
-            BootDecision::Stay { .. } | BootDecision::Hold { .. } => None,
+        match exit(&self.chip, &self.parameters(), self.setup.layout, request) {
+            Exit::Program(Start { number, .. }) => Some(number),
+            Exit::Bootloader { .. } | Exit::Again | Exit::Choose => None,
         }
     }
 

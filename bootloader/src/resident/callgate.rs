@@ -11,6 +11,7 @@
 use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
+use boot_core::decision::crash_count;
 use boot_core::flash::Flash;
 use boot_core::renewal::{check, header, identification, Places};
 use boot_core::store::record::Seal;
@@ -27,7 +28,7 @@ use shared_abi::warm_start::BootRequest;
 use crate::flash::{CrcUnit, ResidentFlash};
 use crate::flash_controller::FlashController;
 use crate::ram_image::{home, HOST};
-use crate::storing::{crash_count, store};
+use crate::storing::store;
 use product::{self, NO_NODE_ID, PRODUCT, SEALED};
 
 /// The entry of all services: it checks the argument structure, takes the flash once, calls the
@@ -137,10 +138,7 @@ fn node(
     let mut parameters = product::parameters(flash);
     if selector == Selector::ReadNode {
         let node = product::node_parameters(&parameters, flash);
-        *args = NodeArgs {
-            node_id: node.id.map_or(NO_NODE_ID, NodeId::get).into(),
-            bit_rate: node.bit_rate.or_zero(),
-        };
+        *args = NodeArgs { node_id: node.id_or_none().into(), bit_rate: node.bit_rate.or_zero() };
         return Ok(());
     }
     let is_allowed = |id: &u8| PRODUCT.node_ids.contains(id) || *id == NO_NODE_ID;

@@ -11,7 +11,6 @@
 //! | `flash_lock.rs` | locks the flash for a sealed program (feature `sealed`) | assembly |
 //! | `storing.rs` | stores a value while nothing else runs | no |
 //! | `ram_image.rs` | checks the rest of the bootloader and copies it to RAM | memory |
-//! | `renewal.rs` | chooses the image: home, or staging | handoff |
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
 //!
 //! It is a complete program, without variables: it uses only the stack and its own code. It is
@@ -29,7 +28,6 @@ mod flash_lock;
 #[path = "../memory.rs"]
 mod memory;
 mod ram_image;
-mod renewal;
 mod service_table;
 mod stage;
 mod storing;

@@ -5,6 +5,7 @@ use core::mem::transmute;
 
 use boot_core::crc::crc32;
 use boot_core::flash::Flash;
+use boot_core::renewal::check_contents;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
 use shared_abi::handoff::Handoff;
@@ -39,43 +40,51 @@ pub fn home() -> Region {
     Region::new(at, home.end() - at)
 }
 
-/// Checks the image in a place, copies it to its RAM, and returns its vectors.
-///
-/// # Errors
-/// The damaged part; the RAM may then hold the image.
+/// The header of the image in a place.
 ///
 /// # Safety
-/// `place` must be [`home`], or staging of the layout. Nothing may use the RAM except its last
-/// [`LEAST_STACK`] bytes.
-pub unsafe fn load(flash: &ResidentFlash, place: Region) -> Result<VectorTable, Damage> {
-    let at = place.base;
-    // SAFETY: it is in flash, aligned; any bits are a valid `Header`, and the flash after it is part of
-    // the place, whose size `check` compares with that of the image.
-    let header = unsafe { &*(at as *const Header) };
-    let data = at + Header::SIZE;
-    header.check(place.end() - data, LAYOUT.ram, HOST)?;
+/// It must be [`home`], or staging of the layout.
+unsafe fn header(place: Region) -> &'static Header {
+    // SAFETY: it is in flash, aligned; any bits are a valid `Header`.
+    unsafe { &*(place.base as *const Header) }
+}
+
+/// Checks the image in a place: its vectors.
+///
+/// # Errors
+/// The damaged part.
+///
+/// # Safety
+/// As for [`header`].
+pub unsafe fn check(flash: &ResidentFlash, place: Region) -> Result<VectorTable, Damage> {
+    // SAFETY: the caller guarantees it.
+    let header = unsafe { header(place) };
+    check_contents(flash, place, header, LAYOUT, HOST)?;
     // An image for the bench has no CRC. A device with keys takes none.
-    let has_keys = SEALED && !flash.is_blank(LAYOUT.key_block());
-    if header.crc != 0 || has_keys {
-        let covered = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.size);
-        if flash.crc32(0, covered) != header.crc {
-            return Err(Damage::Crc);
-        }
+    if SEALED && header.crc == 0 && !flash.is_blank(LAYOUT.key_block()) {
+        return Err(Damage::Crc);
     }
-    // SAFETY: `check` has found that the image, which is longer than two words, ends within its flash.
-    let vectors = header.entry(unsafe { (data as *const [u32; 2]).read_volatile() })?;
-    let words = header.size as usize / 4;
-    // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the
-    // stack its room, and has a multiple of four bytes; both addresses are aligned. The caller
-    // guarantees that nothing else uses the RAM.
+    let vectors = (place.base + Header::SIZE) as *const [u32; 2];
+    // SAFETY: `check_contents` has found that the image, which is longer than two words, ends within its flash.
+    header.entry(unsafe { vectors.read_volatile() })
+}
+
+/// Copies the image in a place to its RAM.
+///
+/// # Safety
+/// [`check`] has found it good. Nothing may use the RAM except its last [`LEAST_STACK`] bytes.
+pub unsafe fn copy(place: Region) {
+    // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the stack its
+    // room, and has a multiple of four bytes; both addresses are aligned. The caller guarantees that nothing
+    // else uses the RAM.
     unsafe {
-        let (from, to) = (data as *const u32, header.ram_base as *mut u32);
-        for n in 0..words {
+        let header = header(place);
+        let (from, to) = ((place.base + Header::SIZE) as *const u32, header.ram_base as *mut u32);
+        for n in 0..header.size as usize / 4 {
             // Volatile: a call of memcpy would copy by bytes.
             to.add(n).write(from.add(n).read_volatile());
         }
     }
-    Ok(vectors)
 }
 
 /// Removes the secrets that the RAM image may have left, wherever a reset has ended it: clears all of the RAM but

@@ -1,36 +1,46 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
+//! It reads what is read once ([`take`]), makes the choice ([`boot_core::decision::choose`]), carries it out, and
+//! ends in [`enter_program`] or [`enter_bootloader`].
+//!
 //! Before it, nothing has used a peripheral. It uses only the reset flags, that of Standby among them, the
 //! warm-start cell, the watchdog, the power and the flash controller, the CRC unit and the entry strap, and leaves the
 //! peripherals to a program in their reset state. The rest of the bootloader gets the CRC unit with its
 //! clock on, for the services.
 
 use boot_core::canopen::program::Supply;
-use boot_core::canopen::NodeId;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
-use boot_core::program::{verify, Invalid};
-use boot_core::store::{Key, Parameters as _, ProgramRecord};
-use bsp::clock::{Source, HSI};
+use boot_core::canopen::BitRate;
+use boot_core::decision::{choose, Exit, Images, PinReset, Start, Store, Woken};
+use boot_core::renewal::Places;
+use boot_core::store::{Key, ProgramRecord};
+use bsp::clock::Source;
 use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::scb::VectActive;
 use cortex_m::peripheral::SCB;
-use shared_abi::boot_report::{BootReport, Reason, Words};
+use shared_abi::boot_report::{BootReport, Words};
+use shared_abi::geometry::Region;
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
-use shared_abi::renewal::{word, Origin, TrialEnd};
+use shared_abi::renewal::{of_word, Origin};
 use shared_abi::vectors::VectorTable;
-use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
+use shared_abi::warm_start::{BootRequest, Cell, Damage};
 
 use crate::caches::Caches;
 use crate::flash::{CrcUnit, ResidentFlash};
-use crate::{ram_image, renewal, storing};
-use product::{self, NO_NODE_ID, PRODUCT, SEALED};
+use crate::{ram_image, storing};
+use product::{self, Chosen, Parameters, NO_NODE_ID, PRODUCT, SEALED};
 
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
 /// the warm-start cell in this time.
 const RESET_PERIOD_MS: u32 = 100;
 
-/// Decides between a program and the bootloader, and starts it: a program in flash, or the RAM image
-/// with a report ([`BootReport`]) of what is left for it.
+/// The peripherals of the boot stage.
+struct Chip {
+    rcc: pac::RCC,
+    iwdg: pac::IWDG,
+    flash: ResidentFlash,
+}
+
+/// Makes the choice after a reset, and carries it out.
 ///
 /// A damaged RAM image does not run. The warm-start cell records the damage, and a program starts:
 /// the first with autostart that may, or another one. If there is none, the chip resets again and again.
@@ -39,171 +49,153 @@ const RESET_PERIOD_MS: u32 = 100;
 /// Nothing else may run yet.
 pub unsafe extern "C" fn stage() -> ! {
     // SAFETY: nothing else runs yet.
-    let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
-
-    // SAFETY: as above.
-    let mut flash = unsafe { ResidentFlash::steal(CrcUnit::Own) };
-    // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
-    // 349 at the fastest LSI.
-    if flash.starts_watchdog() {
-        bsp::watchdog::rescale(&iwdg, bsp::watchdog::SLOWEST);
-    }
-    bsp::low_power::keep_clocks_in_sleep(&rcc);
-
-    let status = rcc.csr().read();
-    // SAFETY: it removes the flags, and leaves the LSI as it is.
-    rcc.csr().write(|w| unsafe { w.bits(status.bits()).rmvf().set_bit() });
-    let reset_cause = ResetCause::from_flags(status.bits(), bsp::low_power::take(&rcc));
-
-    // Without a reset cause an application has jumped here. The flash may be locked, the watchdog, whose
-    // clock is the LSI, may run, and an exception may be active. A reset ends all; the request stays in the
-    // cell.
-    let in_handler = || SCB::vect_active() != VectActive::ThreadMode;
-    if reset_cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set() || in_handler()) {
-        SCB::sys_reset();
-    }
-
+    let mut chip = unsafe { chip() };
     let mut cell = product::warm_start_cell();
-    let is_marked = PRODUCT.two_resets && cell.is_marked();
-    let request = cell.take();
-    if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && reset_cause == ResetCause::Software {
-        // SAFETY: since the reset no interrupt was enabled and no bus master started.
-        unsafe { enter_rom(&rcc) };
-    }
-    let strap = bsp::entry_strap();
-
+    let mut woken = take(&chip.rcc, &mut cell);
     // CRCs need speed, but no exact clock. The crystal would take time to start.
-    Source::Internal.speed_up(&rcc);
-    ResidentFlash::switch_crc_unit_on(&rcc);
-    if SEALED && may_store() {
-        crate::callgate::store_after_reset(&mut flash, request);
-    }
-    let mut parameters = product::parameters(&flash);
-    // A reset that ends the RAM image is no crash of a program.
-    let crash_resets = if PRODUCT.renewal && request.is_none() && renewal::last_report(reset_cause).is_some()
-    {
-        storing::crash_count(&parameters, &flash)
-    } else {
-        count_crash_resets(&mut parameters, &mut flash, reset_cause, request)
-    };
-    // SAFETY: as above; nothing else changes the register until it is dropped.
+    Source::Internal.speed_up(&chip.rcc);
+    ResidentFlash::switch_crc_unit_on(&chip.rcc);
+    // SAFETY: nothing else changes the register until it is dropped, but what restores it at its own end.
     let caches = unsafe { Caches::on() };
+
+    let (choice, parameters) = loop {
+        let mut parameters = product::parameters(&chip.flash);
+        let node = product::node_parameters(&parameters, &chip.flash);
+        (woken.node_id, woken.bit_rate) = (node.id_or_none(), node.bit_rate);
+        let choice = choose(&woken, &images(&chip.flash), &chip.flash, &parameters, Chosen);
+        if let Some(value) = choice.store {
+            store(value, &woken, &mut parameters, &mut chip.flash);
+        }
+        woken.stored = true;
+        if !matches!(choice.exit, Exit::Choose) {
+            break (choice, parameters);
+        }
+    };
     if SEALED {
         // SAFETY: nothing but the stack uses the RAM.
         unsafe { ram_image::wipe() };
     }
+    if choice.waits {
+        await_second_reset(&mut cell);
+    }
+    if let Some(damage) = choice.damage {
+        cell.put(BootRequest::Damaged(damage));
+    }
+    match choice.exit {
+        // SAFETY: since the reset no interrupt was enabled and no bus master started.
+        Exit::Program(start) => unsafe { enter_program(chip, caches, &woken, &parameters, &start) },
+        Exit::Bootloader { place, origin, image, stay, crash_resets, renewal } => {
+            let report = woken.report(stay, crash_resets, renewal);
+            // SAFETY: as above, and only the stack uses the RAM; `choose` has checked the image.
+            unsafe { enter_bootloader(chip, caches, place, origin, image, &report) }
+        }
+        Exit::Again | Exit::Choose => reset_later(),
+    }
+}
 
-    let node = product::node_parameters(&parameters, &flash);
-    let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    let decide = |circumstances: &Circumstances| {
-        decide(circumstances, &DECISION, |number| match PRODUCT.profile.download.data {
-            Some(data) if data == number => Err(Invalid::NoSuchProgram),
-            _ => verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number),
-        })
+/// Takes the peripherals, and sets what must not wait.
+///
+/// # Safety
+/// Nothing else may run.
+unsafe fn chip() -> Chip {
+    // SAFETY: nothing else runs.
+    let chip = unsafe {
+        Chip { rcc: pac::RCC::steal(), iwdg: pac::IWDG::steal(), flash: ResidentFlash::steal(CrcUnit::Own) }
     };
-    let mut circumstances =
-        Circumstances { request, strap, crash_resets, node_id, nearly_full: parameters.is_nearly_full() };
-    let mut trial_end = TrialEnd::None;
-    if PRODUCT.renewal {
-        trial_end = renewal::trial_end(&flash, &parameters, request, reset_cause);
-        if matches!(trial_end, TrialEnd::Reset(_)) && matches!(request, None | Some(BootRequest::Fault)) {
-            // The image at home says why it ended.
-            circumstances.request = Some(BootRequest::Renewal(TrialStep::GivenUp));
-        }
+    // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
+    // 349 at the fastest LSI.
+    if chip.flash.starts_watchdog() {
+        bsp::watchdog::rescale(&chip.iwdg, bsp::watchdog::SLOWEST);
     }
-    let mut decision = decide(&circumstances);
-    if PRODUCT.two_resets {
-        let pin_reset = PinReset::of(reset_cause, request, is_marked);
-        decision = pin_reset.change(decision);
-        if pin_reset == PinReset::First && !matches!(decision, BootDecision::Stay { .. }) {
-            await_second_reset(&mut cell);
-        }
-    }
-    if !matches!(decision, BootDecision::Start { .. }) {
-        // SAFETY: only the stack uses the RAM.
-        match unsafe { renewal::load(&flash, &parameters, request, &mut trial_end) } {
-            Ok((vectors, origin)) => {
-                let report = BootReport {
-                    renewal: word(origin, trial_end),
-                    crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
-                    node_id,
-                    bit_rate: node.bit_rate as u8,
-                    ..boot_report(&decision, request, reset_cause)
-                };
-                drop(caches);
-                if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog_ms) {
-                    // An image that hangs before it starts the watchdog ends, too.
-                    bsp::watchdog::start(&iwdg, ms);
-                }
-                // The image changes the clock. The CRC unit keeps its clock, for the services.
-                // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
-                // image. Since the reset no interrupt was enabled and no bus master started.
-                unsafe {
-                    (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
-                    vectors.jump()
-                }
-            }
-            Err(damage) => cell.put(BootRequest::Damaged(damage)),
-        }
-        // There is no bootloader to stay in, neither for the entry strap nor for the reset pin or a rescue
-        // window: the first program with autostart that may start is resumed at once, or another one.
-        circumstances.strap = false;
-        fallback(&DECISION, |number| {
-            circumstances.request = Some(BootRequest::Resume(number));
-            decision = decide(&circumstances);
-            matches!(decision, BootDecision::Start { .. })
-        });
-    }
+    bsp::low_power::keep_clocks_in_sleep(&chip.rcc);
+    chip
+}
 
-    let mut program_date = 0;
-    if let (true, BootDecision::Start { program, .. }) = (PRODUCT.program_date, &decision) {
-        let number = program.number();
-        if let (Some(record), Some(region)) =
-            (ProgramRecord::load(&parameters, &flash, number), LAYOUT.program(number))
-        {
-            program_date = record.date(&parameters, &flash, number, region);
+/// Reads what is read once, and removes it, so that no later reset reads it again. Does not return after a jump that
+/// left more than a reset does, and if the request is for the loader in the ROM.
+fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
+    let status = rcc.csr().read();
+    // SAFETY: it removes the flags, and leaves the LSI as it is.
+    rcc.csr().write(|w| unsafe { w.bits(status.bits()).rmvf().set_bit() });
+    let cause = ResetCause::from_flags(status.bits(), bsp::low_power::take(rcc));
+    // Without a reset cause an application has jumped here. The flash may be locked, the watchdog, whose
+    // clock is the LSI, may run, and an exception may be active. A reset ends all; the request stays in the
+    // cell.
+    let in_handler = || SCB::vect_active() != VectActive::ThreadMode;
+    if cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set() || in_handler()) {
+        SCB::sys_reset();
+    }
+    let is_marked = PRODUCT.two_resets && cell.is_marked();
+    let request = cell.take();
+    if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && cause == ResetCause::Software {
+        // SAFETY: since the reset no interrupt was enabled and no bus master started.
+        unsafe { enter_rom(rcc) };
+    }
+    Woken {
+        cause,
+        request,
+        is_marked,
+        strap: bsp::entry_strap(),
+        ended: if PRODUCT.renewal { ended(cause) } else { None },
+        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. Nothing has
+        // written it since the program started.
+        program: unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) },
+        node_id: NO_NODE_ID,
+        bit_rate: BitRate::Auto,
+        stored: false,
+    }
+}
+
+/// The origin of the RAM image that ran before this reset, by its report; `None` if a program ran, or the power
+/// failed: a short dip may leave the RAM as it was.
+fn ended(cause: ResetCause) -> Option<Origin> {
+    if matches!(cause, ResetCause::PowerOn | ResetCause::BrownOut) {
+        return None;
+    }
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image; nothing else
+    // runs.
+    let words = unsafe { (LAYOUT.handoff.base as *const Words).read_volatile() };
+    BootReport::parse(&words).map(|report| of_word(report.renewal).0)
+}
+
+/// The places of the RAM image.
+fn images(flash: &ResidentFlash) -> Images<impl Fn(Region) -> Result<VectorTable, Damage> + '_> {
+    let Places { home, staging } = match Places::of(LAYOUT) {
+        Some(places) if PRODUCT.renewal => places,
+        _ => Places { home: ram_image::home(), staging: Region::new(0, 0) },
+    };
+    // SAFETY: they are places of the layout.
+    Images { home, staging, check: |place| unsafe { ram_image::check(flash, place) } }
+}
+
+/// Stores a value, if the supply is good enough for the journal. What is not stored is lost, and the start continues.
+fn store(value: Store, woken: &Woken, parameters: &mut Parameters, flash: &mut ResidentFlash) {
+    if bsp::supply::state() == Supply::Low {
+        return;
+    }
+    match value {
+        Store::Asked => crate::callgate::store_after_reset(flash, woken.request),
+        Store::CrashCount(count) => {
+            let _ = storing::store(parameters, flash, Key::CRASH_COUNT, [count, 0, 0, 0]);
         }
     }
-    let has_watchdog = flash.starts_watchdog();
-    drop(caches);
-    flash.release(&rcc);
-    bsp::low_power::release(&rcc);
-    bsp::slow_down(&rcc);
-    let BootDecision::Start { program, trial } = decision else {
-        // One pass of the loop takes three cycles.
-        cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
-        SCB::sys_reset()
-    };
-    let nameplate = product::nameplate();
-    let handoff = Handoff::new(&BootInfo {
-        node_id,
-        bit_rate: node.bit_rate.or_zero(),
-        program: program.number(),
-        reset_cause,
-        trial,
-        fresh: matches!(request, Some(BootRequest::Fresh(_))),
-        bootloader_version: product::VERSION,
-        serial_number: product::serial_number(nameplate.as_ref()),
-        bootloader_number: PRODUCT.bootloader_number(),
-        sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
-        program_date,
-        nameplate: nameplate.is_some(),
-    });
-    if SEALED && program.locks_flash() {
-        // SAFETY: only this code runs, and it writes the flash no more.
-        unsafe { crate::flash_lock::lock_flash() };
-    }
-    if let Some(ms) = PRODUCT.program_watchdog_ms {
-        bsp::watchdog::start(&iwdg, ms);
-    } else if has_watchdog {
-        bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
-    }
-    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. Since the
-    // reset no interrupt was enabled and no bus master started.
-    unsafe {
-        handoff.write(LAYOUT.handoff.base as *mut Handoff);
-        program.vectors().jump()
-    }
+}
+
+/// Marks the first reset by the pin, and gives the second one its time. A watchdog of the option bytes does not bite
+/// meanwhile: it has its longest time.
+fn await_second_reset(cell: &mut Cell) {
+    let core = Source::Internal.tree().sysclk();
+    bsp::pause(core, PinReset::BOUNCE_MS);
+    cell.mark();
+    bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
+    cell.clear();
+}
+
+/// Resets the chip after [`RESET_PERIOD_MS`].
+fn reset_later() -> ! {
+    // One pass of the loop takes three cycles.
+    cortex_m::asm::delay(Source::Internal.tree().sysclk() / 1000 * RESET_PERIOD_MS / 3);
+    SCB::sys_reset()
 }
 
 /// Enters the loader in the ROM of the chip. Returns if there is none.
@@ -218,69 +210,98 @@ unsafe fn enter_rom(rcc: &pac::RCC) {
     unsafe { vectors.jump() }
 }
 
-/// Marks the first reset by the pin, and gives the second one its time. A watchdog of the option bytes does not bite
-/// meanwhile: it has its longest time.
-fn await_second_reset(cell: &mut Cell) {
-    let core = Source::Internal.tree().sysclk();
-    bsp::pause(core, PinReset::BOUNCE_MS);
-    cell.mark();
-    bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
-    cell.clear();
-}
-
-/// Why the RAM image runs, and what is left for it.
-fn boot_report(decision: &BootDecision, request: Option<BootRequest>, cause: ResetCause) -> BootReport {
-    let (reason, refused, held_program, window_ms) = match *decision {
-        BootDecision::Stay { reason, refused } => (reason, refused, 0, 0),
-        BootDecision::Hold { program, window_ms: 0 } => (Reason::Compaction, 0, program, 0),
-        BootDecision::Hold { program, window_ms } => (Reason::Rescue, 0, program, window_ms),
-        BootDecision::Start { program, .. } => (Reason::Rescue, 0, program.number(), 0),
-    };
-    let (returned, program_reset) = match request {
-        // An application that requests the bootloader has shown that it can be called back. The handoff
-        // has its number; nothing has written it since.
-        Some(BootRequest::Stay | BootRequest::Owed(_)) => {
-            // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
-            let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
-            (program, cause as u8)
-        }
-        None => (0, cause as u8),
-        // The bootloader itself left these requests.
-        Some(_) => (0, 0),
-    };
-    let owed = if let Some(BootRequest::Owed(owed)) = request { owed } else { Owed::NOTHING };
-    BootReport {
-        reason: reason as u8,
-        refused,
-        program_reset,
-        held_program,
-        window_ms,
-        owed,
-        returned,
-        ..BootReport::NONE
+/// Enters the RAM image in a place, with a report of what is left for it.
+///
+/// # Safety
+/// The image must be good ([`ram_image::check`]). No interrupt may be enabled, no bus master started, and only the
+/// stack may use the RAM.
+// One call: without a function of its own it is shorter.
+#[inline(always)]
+unsafe fn enter_bootloader(
+    chip: Chip,
+    caches: Caches,
+    place: Region,
+    origin: Origin,
+    vectors: VectorTable,
+    report: &BootReport,
+) -> ! {
+    // SAFETY: the caller guarantees it.
+    unsafe { ram_image::copy(place) };
+    drop(caches);
+    if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog_ms) {
+        // An image that hangs before it starts the watchdog ends, too.
+        bsp::watchdog::start(&chip.iwdg, ms);
+    }
+    // The image changes the clock. The CRC unit keeps its clock, for the services.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The caller
+    // guarantees the rest.
+    unsafe {
+        (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
+        vectors.jump()
     }
 }
 
-/// The product's policy for the decision.
-const DECISION: boot_core::decision::Policy = PRODUCT.decision();
-
-/// Whether the supply is good enough for the journal. What is not stored is lost, and the start continues.
-fn may_store() -> bool {
-    bsp::supply::state() != Supply::Low
+/// Starts a program on a clean chip.
+///
+/// # Safety
+/// No interrupt may be enabled, and no bus master started.
+// One call: without a function of its own it is shorter.
+#[inline(always)]
+unsafe fn enter_program(
+    chip: Chip,
+    caches: Caches,
+    woken: &Woken,
+    parameters: &Parameters,
+    start: &Start,
+) -> ! {
+    let handoff = handoff(woken, start, date(start, parameters, &chip.flash));
+    let has_watchdog = chip.flash.starts_watchdog();
+    drop(caches);
+    chip.flash.release(&chip.rcc);
+    bsp::low_power::release(&chip.rcc);
+    bsp::slow_down(&chip.rcc);
+    if SEALED && start.locks_flash {
+        // SAFETY: only this code runs, and it writes the flash no more.
+        unsafe { crate::flash_lock::lock_flash() };
+    }
+    if let Some(ms) = PRODUCT.program_watchdog_ms {
+        bsp::watchdog::start(&chip.iwdg, ms);
+    } else if has_watchdog {
+        bsp::watchdog::rescale(&chip.iwdg, bsp::watchdog::AFTER_RESET);
+    }
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The caller
+    // guarantees the rest.
+    unsafe {
+        handoff.write(LAYOUT.handoff.base as *mut Handoff);
+        start.vectors.jump()
+    }
 }
 
-/// Updates the number of resets in a row by which an application ended without a request.
-fn count_crash_resets(
-    parameters: &mut product::Parameters,
-    flash: &mut ResidentFlash,
-    reset_cause: ResetCause,
-    request: Option<BootRequest>,
-) -> u32 {
-    let before = storing::crash_count(parameters, flash);
-    let now = DECISION.crash_resets(before, reset_cause, request);
-    if now != before && may_store() {
-        // If the store fails, the count is lost, but the start continues.
-        let _ = storing::store(parameters, flash, Key::CRASH_COUNT, [now, 0, 0, 0]);
+/// The date of a program, for the handoff; 0 if it is not known, or the product has no dates.
+fn date(start: &Start, parameters: &Parameters, flash: &ResidentFlash) -> u32 {
+    let number = start.number;
+    let record = || Some((ProgramRecord::load(parameters, flash, number)?, LAYOUT.program(number)?));
+    match PRODUCT.program_date.then(record).flatten() {
+        Some((record, region)) => record.date(parameters, flash, number, region),
+        None => 0,
     }
-    now
+}
+
+/// What a program is told.
+fn handoff(woken: &Woken, start: &Start, program_date: u32) -> Handoff {
+    let nameplate = product::nameplate();
+    Handoff::new(&BootInfo {
+        node_id: woken.node_id,
+        bit_rate: woken.bit_rate.or_zero(),
+        program: start.number,
+        reset_cause: woken.cause,
+        trial: start.trial,
+        fresh: matches!(woken.request, Some(BootRequest::Fresh(_))),
+        bootloader_version: product::VERSION,
+        serial_number: product::serial_number(nameplate.as_ref()),
+        bootloader_number: PRODUCT.bootloader_number(),
+        sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
+        program_date,
+        nameplate: nameplate.is_some(),
+    })
 }

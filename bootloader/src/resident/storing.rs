@@ -21,8 +21,3 @@ pub fn store(
     parameters.store(key, value);
     run(flash, |flash, outcome| parameters.next(flash, outcome))
 }
-
-/// Resets in a row by which an application ended without a request.
-pub fn crash_count(parameters: &Parameters, flash: &ResidentFlash) -> u32 {
-    parameters.get(flash, Key::CRASH_COUNT).map_or(0, |[count, ..]| count)
-}

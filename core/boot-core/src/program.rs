@@ -7,6 +7,7 @@ use shared_abi::vectors::{VectorFault, VectorTable};
 use crate::crc::CrcKind;
 use crate::flash::{fold, Flash};
 use crate::keys::is_sealed;
+use crate::store::record::Seal;
 use crate::store::{Parameters, ProgramRecord};
 
 /// A CRC over flash, computed in steps of limited length.
@@ -69,9 +70,11 @@ pub enum Invalid {
 /// A program that has passed every check of its contents. Only [`verify`] makes this value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VerifiedProgram {
-    number: u8,
-    record: ProgramRecord,
     vectors: VectorTable,
+    number: u8,
+    signed: bool,
+    confirmed: bool,
+    locks_flash: bool,
 }
 
 impl VerifiedProgram {
@@ -84,20 +87,20 @@ impl VerifiedProgram {
     /// Whether the program is released for autostart.
     #[must_use]
     pub const fn signed(&self) -> bool {
-        self.record.signed
+        self.signed
     }
 
     /// Whether the program has proved that it can return to the bootloader, so that it starts
     /// without a rescue window.
     #[must_use]
     pub const fn confirmed(&self) -> bool {
-        self.record.confirmed
+        self.confirmed
     }
 
     /// Whether the flash must be locked until the next reset before the program starts.
     #[must_use]
-    pub fn locks_flash(&self) -> bool {
-        self.record.seal == Some(crate::store::record::Seal::Locked)
+    pub const fn locks_flash(&self) -> bool {
+        self.locks_flash
     }
 
     /// The vectors for the jump.
@@ -144,5 +147,6 @@ pub fn verify<F: Flash>(
     if !crc.step(flash, kind, record.size) || crc.value() != record.crc {
         return Err(Invalid::Crc);
     }
-    Ok(VerifiedProgram { number, record, vectors })
+    let ProgramRecord { signed, confirmed, seal, .. } = record;
+    Ok(VerifiedProgram { vectors, number, signed, confirmed, locks_flash: seal == Some(Seal::Locked) })
 }

@@ -1,6 +1,8 @@
 //! Which RAM image of the bootloader is loaded, and whether one is good (docs/renewal.md). The
 //! resident part and the RAM image both use this.
 
+use core::array;
+
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Host};
@@ -97,11 +99,7 @@ impl Places {
 
 /// The header of the image in a place.
 pub fn header<F: Flash>(flash: &F, place: Region) -> Header {
-    let mut words = [0; Header::SIZE as usize / 4];
-    for (word, at) in words.iter_mut().zip((place.base..).step_by(4)) {
-        *word = flash.read_word(at);
-    }
-    Header::of_words(words)
+    Header::of_words(array::from_fn(|n| flash.read_word(place.base + 4 * n as u32)))
 }
 
 /// 1F56h of an image: the CRC in its header; over an image for the bench, which has none, the CRC of its
@@ -113,6 +111,25 @@ pub fn identification<F: Flash>(flash: &F, place: Region, header: &Header) -> u3
     }
 }
 
+/// Checks header and CRC of the image in a place. An image for the bench has no CRC, and passes.
+///
+/// # Errors
+/// The damage.
+pub fn check_contents<F: Flash>(
+    flash: &F,
+    place: Region,
+    header: &Header,
+    layout: &Layout,
+    host: Host,
+) -> Result<(), Damage> {
+    header.check(place.size - Header::SIZE, layout.ram, host)?;
+    let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
+    if header.crc != 0 && flash.crc32(0, covered) != header.crc {
+        return Err(Damage::Crc);
+    }
+    Ok(())
+}
+
 /// Checks an image that is to replace the bootloader, completely: its header, its CRC, its entry. An
 /// image without a CRC, which is for the bench, is refused.
 ///
@@ -120,9 +137,8 @@ pub fn identification<F: Flash>(flash: &F, place: Region, header: &Header) -> u3
 /// The damage.
 pub fn check<F: Flash>(flash: &F, place: Region, layout: &Layout, host: Host) -> Result<Header, Damage> {
     let header = header(flash, place);
-    header.check(place.size - Header::SIZE, layout.ram, host)?;
-    let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
-    if header.crc == 0 || flash.crc32(0, covered) != header.crc {
+    check_contents(flash, place, &header, layout, host)?;
+    if header.crc == 0 {
         return Err(Damage::Crc);
     }
     let vectors = place.base + Header::SIZE;

@@ -15,12 +15,11 @@ use boot_core::canopen::program::ProgramStart;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
-use boot_core::decision::{decide, Autostart, BootDecision, Circumstances, Policy};
-use boot_core::flash::Flash as _;
-use boot_core::program::verify;
-use boot_core::store::{Journal, NodeParameters, ProgramRecord};
+use boot_core::decision::{self, choose, Exit, Images, Policy, Store, Woken};
+use boot_core::flash::{run, Flash as _};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters as _, ProgramRecord};
 use coboot_app::{Defaults, Next, Start};
-use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::{BootRequest, Owed};
 
@@ -36,32 +35,21 @@ pub const BUFFER: usize = 80 * 1024;
 const ANSWER_TO_RESET_MS: u32 = 15;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
-/// The firmware's policy for the boot decision.
-const POLICY: Policy = Policy {
-    autostart: Autostart::InOrder,
-    programs: &[1, 2],
-    max_crash_resets: 3,
-    node_ids: 1..=127,
-    rescue_window_ms: 0,
-    rescue_window_confirmed_ms: 0,
-    start_allowed: |_| true,
-};
+/// The numbers of its programs, which all start by themselves.
+const PROGRAM_NUMBERS: [u8; 2] = [1, 2];
 
-/// A bootloader with everything, which starts its programs by [`POLICY`].
+/// A bootloader with everything, which starts its programs by itself.
 struct Ours<const PROGRAMS: usize>;
 
 impl<const PROGRAMS: usize> Choices for Ours<PROGRAMS> {
     const PROGRAM_START: ProgramStart = ProgramStart {
         by_itself: match PROGRAMS {
-            1 => [POLICY.programs[0], 0],
-            _ => [POLICY.programs[0], POLICY.programs[1]],
+            1 => [PROGRAM_NUMBERS[0], 0],
+            _ => PROGRAM_NUMBERS,
         },
         ..ProgramStart::NONE
     };
 }
-
-/// The value for "no node-ID" (CiA 305).
-const NO_NODE_ID: u8 = 255;
 
 /// The constant properties of a device.
 #[derive(Clone, Copy, Debug)]
@@ -113,8 +101,6 @@ pub struct Device<'b, const PROGRAMS: usize> {
     setup: Setup,
     /// What is started as its programs.
     command: Option<&'b Command>,
-    /// How many times in a row a program has ended by itself.
-    crash_resets: u32,
     phase: Phase<'b, PROGRAMS>,
 }
 
@@ -176,8 +162,8 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         flash: FileFlash,
         buffer: &'b mut [u8],
     ) -> (Self, Event) {
-        let mut device = Self { setup, command, crash_resets: 0, phase: Phase::None };
-        let event = device.reset(Idle { flash, buffer }, None);
+        let mut device = Self { setup, command, phase: Phase::None };
+        let event = device.reset(Idle { flash, buffer }, ResetCause::PowerOn, None);
         (device, event)
     }
 
@@ -265,42 +251,31 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 Phase::Silent(idle) => idle,
                 Phase::None => return Ok(false),
             };
-            self.crash_resets = POLICY.crash_resets(self.crash_resets, cause, request);
-            tell(self.reset(idle, request));
+            tell(self.reset(idle, cause, request));
             more = true;
         }
         Ok(more)
     }
 
     /// The boot stage: selects bootloader or program.
-    fn reset(&mut self, idle: Idle<'b>, request: Option<BootRequest>) -> Event {
+    fn reset(&mut self, idle: Idle<'b>, cause: ResetCause, request: Option<BootRequest>) -> Event {
         let Setup { config, stand_in, serial_number, node, strap } = self.setup;
-        let Idle { flash, buffer } = idle;
-        let journal = Journal::open(&flash, config.layout.parameters);
+        let Idle { mut flash, buffer } = idle;
+        let mut journal = Journal::open(&flash, config.layout.parameters);
         let node = NodeParameters::load(&journal, &flash, node, supports);
-        let circumstances = Circumstances {
-            request,
-            strap,
-            crash_resets: self.crash_resets,
-            node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
-            // Its stand-ins may erase: no core stalls.
-            nearly_full: false,
-        };
-        let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
-        let decision = decide(&circumstances, &POLICY, verified);
-        match decision {
-            // A program that is delayed cannot occur: no rescue window, no journal that is nearly full.
-            BootDecision::Stay { .. } | BootDecision::Hold { .. } => {
-                let (reason, refused) = match decision {
-                    BootDecision::Stay { reason, refused } => (reason, refused),
-                    _ => (Reason::Rescue, 0),
-                };
-                let report = BootReport {
-                    reason: reason as u8,
-                    refused,
-                    crash_resets: self.crash_resets.min(u8::MAX.into()) as u8,
-                    ..BootReport::NONE
-                };
+        let policy = Policy { crc: config.download.crc, ..Policy::plain(config.layout, &PROGRAM_NUMBERS) };
+        let woken = Woken { cause, request, strap, ..Woken::power_on(node.id_or_none(), node.bit_rate) };
+        let choice = choose(&woken, &Images::SOUND, &flash, &journal, &policy);
+        if let Some(Store::CrashCount(count)) = choice.store {
+            journal.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
+            // As on the chip, the start continues if that fails.
+            let _ = run(&mut flash, |flash, outcome| journal.next(flash, outcome));
+        }
+        match choice.exit {
+            Exit::Again | Exit::Choose => unreachable!("its bootloader is whole, and it is not sealed"),
+            Exit::Bootloader { stay, crash_resets, renewal, .. } => {
+                let report = woken.report(stay, crash_resets, renewal);
+                let reason = stay.reason;
                 let device = Bootloader::new(
                     config,
                     serial_number,
@@ -322,8 +297,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 self.phase = Phase::Bootloader(Box::new(running));
                 Event::Bootloader { node: node.id, reason }
             }
-            BootDecision::Start { program, trial } => {
-                let number = program.number();
+            Exit::Program(decision::Start { number, trial, .. }) => {
                 self.phase = match stand_in {
                     None => Phase::Silent(Idle { flash, buffer }),
                     Some(entries) => {
@@ -341,11 +315,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                         // A lift's bootloader is another node.
                         let hands_over = config.node_id.is_none();
                         let hosted = self.command.map(|command| {
-                            let place = Place {
-                                serial_number,
-                                node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
-                                program: number,
-                            };
+                            let place = Place { serial_number, node_id: node.id_or_none(), program: number };
                             let program = contents(&flash, &journal, config, number);
                             let file = flash.path().with_extension(format!("program{number}"));
                             let process = Process::start(command, &file, &program, place);

@@ -1,17 +1,19 @@
 //! Devices whose bootloader can be renewed: their layouts, RAM images for them, and the part of the resident part
 //! that loads one (docs/renewal.md).
 
+use boot_core::canopen::BitRate;
 use boot_core::control::Renewal;
 use boot_core::crc32;
+use boot_core::decision::{choose, Exit, Images, Policy, Woken};
 use boot_core::flash::Flash;
-use boot_core::renewal::{header, Places};
-use boot_core::store::{Journal, RenewalRecord};
+use boot_core::renewal::{check_contents, header, Places};
+use boot_core::store::Journal;
 use shared_abi::abilities::Abilities;
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
-use shared_abi::renewal::{Origin, TrialEnd};
-use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
+use shared_abi::renewal::{of_word, Origin, TrialEnd};
+use shared_abi::warm_start::{BootRequest, Damage};
 
 use crate::model::{CHIP, ONE_PROGRAM};
 
@@ -110,19 +112,14 @@ pub fn crc_of(image: &[u8]) -> u32 {
     u32::from_le_bytes(image[4..8].try_into().unwrap())
 }
 
-/// The checks of the resident part before it loads an image (bootloader/src/resident/ram_image.rs).
+/// The checks of the resident part before it loads an image.
 pub fn load(flash: &impl Flash, place: Region, host: Host) -> Result<Header, Damage> {
     let header = header(flash, place);
-    header.check(place.size - Header::SIZE, LAYOUT.ram, host)?;
-    let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
-    if header.crc != 0 && flash.crc32(0, covered) != header.crc {
-        return Err(Damage::Crc);
-    }
-    Ok(header)
+    check_contents(flash, place, &header, &LAYOUT, host).map(|()| header)
 }
 
-/// The image that the resident part loads after a reset with this request; `None` if it can load none
-/// (bootloader/src/resident/renewal.rs).
+/// The image that the boot stage loads after a reset with this request, if it stays in the bootloader; `None` if it can
+/// load none.
 pub fn loads(
     flash: &impl Flash,
     layout: &Layout,
@@ -130,19 +127,12 @@ pub fn loads(
     request: Option<BootRequest>,
 ) -> Option<(Header, Origin, TrialEnd)> {
     let journal = Journal::open(flash, layout.parameters);
-    let record = RenewalRecord::load(&journal, flash);
-    let mut trial_end = match request {
-        Some(BootRequest::Renewal(TrialStep::Late)) => TrialEnd::Late,
-        Some(BootRequest::Renewal(TrialStep::GivenUp)) => TrialEnd::GivenUp,
-        _ => TrialEnd::None,
-    };
-    let tries = request == Some(BootRequest::Renewal(TrialStep::Try));
-    for (place, origin) in PLACES.order(flash, record, tries).into_iter().flatten() {
-        match load(flash, place, host) {
-            Ok(header) => return Some((header, origin, trial_end)),
-            Err(damage) if origin == Origin::Trial => trial_end = TrialEnd::Damaged(damage),
-            Err(_) => {}
-        }
+    let woken = Woken { request, strap: true, ..Woken::power_on(1, BitRate::K125) };
+    let images =
+        Images { home: PLACES.home, staging: PLACES.staging, check: |place| load(flash, place, host) };
+    let policy = Policy { renewal: true, ..Policy::plain(&LAYOUT, &[1]) };
+    match choose(&woken, &images, flash, &journal, &policy).exit {
+        Exit::Bootloader { origin, image, renewal, .. } => Some((image, origin, of_word(renewal).1)),
+        _ => None,
     }
-    None
 }

@@ -8,15 +8,14 @@ use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Objects};
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::control::{Policy, SealedMemory, Step};
-use boot_core::crc::CrcKind;
 use boot_core::crc32;
-use boot_core::decision::{self, decide, Autostart, BootDecision, Circumstances};
+use boot_core::decision::{self, choose, Autostart, Exit, Images, Start, Woken};
 use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
 use boot_core::profile::Profile;
-use boot_core::program::verify;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
+use shared_abi::warm_start::BootRequest;
 
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
@@ -48,16 +47,20 @@ static LOCKED_LIFT: Config = Config {
     ..STANDARD_2.config
 };
 
-/// The boot decision of these tests: program 1 starts by itself, and there is no rescue window.
-pub const DECISION: decision::Policy = decision::Policy {
-    autostart: Autostart::List(&[1]),
-    programs: &[1, 2],
-    max_crash_resets: 3,
-    node_ids: 1..=127,
-    rescue_window_ms: 0,
-    rescue_window_confirmed_ms: 0,
-    start_allowed: |_| true,
-};
+/// The exit of the boot stage in these tests: program 1 starts by itself, there is no rescue window, and the bootloader
+/// is whole.
+pub fn exit(
+    flash: &impl Flash,
+    parameters: &impl Parameters,
+    layout: &'static Layout,
+    request: Option<BootRequest>,
+) -> Exit<()> {
+    let policy =
+        decision::Policy { autostart: Autostart::List(&[1]), ..decision::Policy::plain(layout, &[1, 2]) };
+    let node = NodeParameters::load(parameters, flash, BOARD_NODE, |_| true);
+    let woken = Woken { request, ..Woken::power_on(node.id_or_none(), node.bit_rate) };
+    choose(&woken, &Images::SOUND, flash, parameters, &policy).exit
+}
 
 /// Node-ID and bit rate of a device without stored values.
 pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K125 };
@@ -126,28 +129,17 @@ impl Device {
     /// # Errors
     /// If a program would run that is not one of the tests' complete programs.
     pub fn decision(&self) -> Result<Outcome, String> {
-        let parameters = self.parameters();
-        let node = NodeParameters::load(&parameters, &self.flash, BOARD_NODE, |_| true);
-        let circumstances = Circumstances {
-            request: None,
-            strap: false,
-            crash_resets: 0,
-            node_id: node.id.map_or(255, NodeId::get),
-            nearly_full: false,
-        };
-        match decide(&circumstances, &DECISION, |n| {
-            verify(&self.flash, &parameters, &LAYOUT, CrcKind::Crc32, n)
-        }) {
-            BootDecision::Stay { .. } | BootDecision::Hold { .. } => Ok(Outcome::Bootloader),
-            BootDecision::Start { program, .. } => {
-                let region = LAYOUT.programs[usize::from(program.number()) - 1];
+        match exit(&self.flash, &self.parameters(), &LAYOUT, None) {
+            Exit::Bootloader { .. } | Exit::Again | Exit::Choose => Ok(Outcome::Bootloader),
+            Exit::Program(Start { number, .. }) => {
+                let region = LAYOUT.programs[usize::from(number) - 1];
                 let cells = self.flash.cells(region);
                 let seed = cells[8];
-                let whole = image(program.number(), seed);
+                let whole = image(number, seed);
                 if cells[..whole.len()] == whole[..] {
                     Ok(Outcome::Runs(seed))
                 } else {
-                    Err(format!("program {} would be started, and is not whole", program.number()))
+                    Err(format!("program {number} would be started, and is not whole"))
                 }
             }
         }

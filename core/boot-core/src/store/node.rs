@@ -16,7 +16,7 @@ pub struct NodeParameters {
 }
 
 /// The stored form of "no node-ID" (CiA 305).
-const NO_NODE_ID: u32 = 0xFF;
+const NO_NODE_ID: u8 = 0xFF;
 
 impl NodeParameters {
     /// The stored values; the board's own values if nothing is stored, or nothing that this
@@ -36,7 +36,7 @@ impl NodeParameters {
 
     fn from_value([id, rate, ..]: Value) -> Option<Self> {
         let id = match id {
-            NO_NODE_ID => None,
+            id if id == u32::from(NO_NODE_ID) => None,
             id => Some(NodeId::new(u8::try_from(id).ok()?)?),
         };
         Some(Self { id, bit_rate: BitRate::from_index(u8::try_from(rate).ok()?)? })
@@ -45,6 +45,12 @@ impl NodeParameters {
     /// The stored form.
     #[must_use]
     pub fn value(&self) -> Value {
-        [self.id.map_or(NO_NODE_ID, |id| id.get().into()), self.bit_rate as u32, 0, 0]
+        [self.id_or_none().into(), self.bit_rate as u32, 0, 0]
+    }
+
+    /// The node-ID; 255 for none.
+    #[must_use]
+    pub fn id_or_none(&self) -> u8 {
+        self.id.map_or(NO_NODE_ID, NodeId::get)
     }
 }
