@@ -1,5 +1,5 @@
-//! The choice of the boot stage: a table of all that it may find, against rules that say what a device never does, and
-//! what it always does.
+//! The choice of the boot stage: a table of all that it may find, against rules that say what a device never
+//! does, and what it always does.
 
 use std::task::Poll;
 
@@ -407,134 +407,112 @@ impl Facts<'_> {
     fn tries(&self) -> bool {
         self.row.cell == (13, 1) && self.staging(&[State::Staged])
     }
+
+    /// How the last trial of an image ended.
+    fn trial_end(&self) -> TrialEnd {
+        match self.row.cell {
+            _ if !self.policy.renewal => TrialEnd::None,
+            (13, 2) => TrialEnd::Late,
+            (13, 3) => TrialEnd::GivenUp,
+            (13, 1) if self.tries() && !self.row.bootloader.staging_loads => TrialEnd::Damaged(Damage::Board),
+            _ if self.trial_broke_off() => TrialEnd::Reset(self.row.cause),
+            _ => TrialEnd::None,
+        }
+    }
+}
+
+/// Notes each rule that is broken: what must hold if a condition does.
+macro_rules! rules {
+    ($broken:ident: $($text:literal if $condition:expr => $holds:expr;)*) => {
+        $(if $condition && !$holds {
+            $broken.push($text);
+        })*
+    };
 }
 
 /// Each rule that the choice breaks.
 fn broken(facts: &Facts, choice: &Choice<()>) -> Vec<&'static str> {
     let mut broken = Vec::new();
-    let mut rule = |text, condition: bool, holds: bool| {
-        if condition && !holds {
-            broken.push(text);
-        }
-    };
     let Choice { store, waits, damage, exit } = *choice;
     let Row { bootloader, stored, crashes, .. } = *facts.row;
     let Bootloader { home_loads, staging_loads, at_home, .. } = bootloader;
 
-    // What a sealed program asked for.
     let asked = facts.policy.sealed && facts.asks(&[10, 11, 12]) && !stored;
-    rule(
-        "what a sealed program asked for is stored before anything else is decided",
-        asked,
-        *choice == Choice { store: Some(Store::Asked), waits: false, damage: None, exit: Exit::Choose },
-    );
+    let first = Choice { store: Some(Store::Asked), waits: false, damage: None, exit: Exit::Choose };
+    rules! { broken:
+        "what a sealed program asked for is stored before anything else is decided"
+            if asked => *choice == first;
+    }
     if asked {
         return broken;
     }
-    rule("the choice is made", true, exit != Exit::Choose);
-    rule(
-        "a count is stored if it changes",
-        true,
-        store == (facts.crashes() != crashes).then_some(Store::CrashCount(facts.crashes())),
-    );
-    rule(
-        "only a start after the first of two resets waits",
-        true,
-        waits == (facts.pin_resets() == 1 && facts.starts().is_some()),
-    );
-    rule(
-        "damage is left in the cell if no image loads, and for no other reason",
-        true,
-        damage.is_none() || !facts.any_image() && damage == Some(Damage::Crc),
-    );
-
+    let crashes = (facts.crashes() != crashes).then_some(Store::CrashCount(facts.crashes()));
+    let can_stay = facts.any_image();
     let starts = if let Exit::Program(Start { number, .. }) = exit { Some(number) } else { None };
-    if let Exit::Program(Start { number, trial, .. }) = exit {
-        rule(
-            "no program starts that is not whole, released or asked for once, and allowed",
-            true,
-            facts.may_start(number),
-        );
-        rule(
-            "a trial is the start of a program that is not released",
-            true,
-            trial == (facts.program(number) == Unreleased),
-        );
+    let is_held = facts.starts().is_some_and(|number| facts.window(number) > 0 || facts.is_compacted());
+    let order = facts.autostart().iter().chain(facts.policy.programs);
+    let any = order.copied().find(|number| facts.is_free(*number));
+    rules! { broken:
+        "the choice is made"
+            if true => exit != Exit::Choose;
+        "a count is stored if it changes"
+            if true => store == crashes;
+        "only a start after the first of two resets waits"
+            if true => waits == (facts.pin_resets() == 1 && facts.starts().is_some());
+        "damage is left in the cell if no image loads, and for no other reason"
+            if damage.is_some() => !can_stay && damage == Some(Damage::Crc);
+        "no program starts that is not whole, released or asked for once, and allowed"
+            if starts.is_some() => starts.is_some_and(|number| facts.may_start(number));
+        "a device with an image that loads never starts a program when the bootloader is wanted"
+            if can_stay && facts.wants_bootloader() => starts.is_none();
+        "a device with an image that loads never starts a program after a crash loop"
+            if can_stay && facts.is_crash_loop() => starts.is_none();
+        "a device with an image that loads never starts a program after two resets"
+            if can_stay && facts.pin_resets() == 2 => starts.is_none();
+        "a device with an image that loads never starts a program whose turn it is not"
+            if can_stay && starts.is_some() => starts == facts.next();
+        "a device with an image that loads never starts a program that is held back"
+            if can_stay && is_held => starts.is_none();
+        "a device with an image that loads never resets again and again"
+            if can_stay => exit != Exit::Again;
+        "a program whose turn it is starts"
+            if facts.starts().is_some() && !is_held && facts.pin_resets() < 2 =>
+                starts == facts.starts() && damage.is_none();
+        "without any image a released program starts, the preferred one first"
+            if damage.is_some() => starts == any && (any.is_some() || exit == Exit::Again);
+        "a device resets again and again only without an image and a program"
+            if exit == Exit::Again => !can_stay && any.is_none() && damage.is_some();
     }
-    rule(
-        "a device with an image that loads never starts a program when the bootloader is wanted",
-        facts.any_image(),
-        starts.is_none() || !facts.wants_bootloader(),
-    );
-    rule(
-        "a device with an image that loads never starts a program after a crash loop",
-        facts.any_image(),
-        starts.is_none() || !facts.is_crash_loop(),
-    );
-    rule(
-        "a device with an image that loads never starts a program after two resets",
-        facts.any_image(),
-        starts.is_none() || facts.pin_resets() < 2,
-    );
-    rule(
-        "a device with an image that loads never starts a program whose turn it is not",
-        facts.any_image(),
-        starts.is_none() || starts == facts.next(),
-    );
-    rule(
-        "a device with an image that loads never resets again and again",
-        facts.any_image(),
-        exit != Exit::Again,
-    );
-    let holds = facts.starts().is_some_and(|number| facts.window(number) > 0 || facts.is_compacted());
-    rule(
-        "a program whose turn it is starts",
-        facts.starts().is_some() && !holds && facts.pin_resets() < 2,
-        starts == facts.starts() && damage.is_none(),
-    );
-    rule("a program that is held back does not start at once", holds && facts.any_image(), starts.is_none());
-
-    // Without a bootloader.
-    let first = facts.autostart().iter().chain(facts.policy.programs);
-    let any = first.copied().find(|number| facts.is_free(*number));
-    rule(
-        "without any image a released program starts, the preferred one first",
-        damage.is_some(),
-        starts == any && (any.is_some() || exit == Exit::Again),
-    );
-    rule(
-        "a device resets again and again only without an image and a program",
-        exit == Exit::Again,
-        !facts.any_image() && any.is_none() && damage.is_some(),
-    );
-
+    if let Exit::Program(Start { number, trial, .. }) = exit {
+        rules! { broken:
+            "a trial is the start of a program that is not released"
+                if true => trial == (facts.program(number) == Unreleased);
+        }
+    }
     if let Exit::Bootloader { place, origin, stay, crash_resets, renewal, .. } = exit {
-        rule(
-            "an image that does not load is never entered",
-            true,
-            if place == HOME { home_loads } else { staging_loads && place == STAGING },
-        );
-        rule("the origin is that of the place", true, (place == HOME) == (origin == Origin::Home));
-        rule("what is on trial runs once, by a request", origin == Origin::Trial, facts.tries());
-        rule("a trial that was asked for is made", facts.tries() && staging_loads, origin == Origin::Trial);
-        rule(
-            "only a confirmed image takes the place of home",
-            origin == Origin::Confirmed,
-            facts.staging(&[State::Confirmed]) && (at_home != Foreign || !home_loads),
-        );
-        rule(
-            "a confirmed image runs, unless a probe has written home",
-            facts.staging(&[State::Confirmed]),
-            origin == Origin::Confirmed || !staging_loads || at_home == Foreign && home_loads,
-        );
-        rule(
-            "the spare runs only if home is damaged",
-            origin == Origin::Spare,
-            facts.staging(&[State::Installed]) && !home_loads,
-        );
-        rule("the count that is reported is that of now", true, crash_resets == facts.crashes());
+        let is_confirmed = facts.staging(&[State::Confirmed]);
+        rules! { broken:
+            "an image that does not load is never entered"
+                if true => if place == HOME { home_loads } else { staging_loads && place == STAGING };
+            "the origin is that of the place"
+                if true => (place == HOME) == (origin == Origin::Home);
+            "what is on trial runs once, by a request"
+                if origin == Origin::Trial => facts.tries();
+            "a trial that was asked for is made"
+                if facts.tries() && staging_loads => origin == Origin::Trial;
+            "only a confirmed image takes the place of home"
+                if origin == Origin::Confirmed => is_confirmed && (at_home != Foreign || !home_loads);
+            "a confirmed image runs, unless a probe has written home"
+                if is_confirmed && staging_loads && !(at_home == Foreign && home_loads) =>
+                    origin == Origin::Confirmed;
+            "the spare runs only if home is damaged"
+                if origin == Origin::Spare => facts.staging(&[State::Installed]) && !home_loads;
+            "the count that is reported is that of now"
+                if true => crash_resets == facts.crashes();
+            "the end of a trial is reported, and nothing else"
+                if true => of_word(renewal).1 == facts.trial_end();
+        }
         broken.extend(broken_stay(facts, stay));
-        broken.extend(broken_end(facts, of_word(renewal).1));
     }
     broken
 }
@@ -542,79 +520,54 @@ fn broken(facts: &Facts, choice: &Choice<()>) -> Vec<&'static str> {
 /// Each rule that the reason to stay breaks.
 fn broken_stay(facts: &Facts, stay: Stay) -> Vec<&'static str> {
     let mut broken = Vec::new();
-    let mut rule = |text, condition: bool, holds: bool| {
-        if condition && !holds {
-            broken.push(text);
-        }
-    };
     let Stay { reason, refused, held, window_ms } = stay;
     let ended = facts.trial_broke_off() && (facts.asks_nothing() || facts.asks(&[4]));
-    rule("who asks for the bootloader is named first", facts.asks(&[1, 7]), reason == Reason::Requested);
-    rule("a fault is named", facts.asks(&[4]) && !ended, reason == Reason::Fault);
-    rule("a trial, and its end, are named", facts.asks(&[13]) || ended, reason == Reason::Renewal);
     let asked = facts.asks(&[1, 4, 7, 13]) || ended;
-    rule("the strap is named", facts.row.strap && !asked, reason == Reason::Strap);
-    let free = !facts.wants_bootloader() && !ended;
-    rule("a crash loop is named", free && facts.is_crash_loop(), reason == Reason::CrashLoop);
-    rule("a crash loop is one", reason == Reason::CrashLoop, free && facts.is_crash_loop());
-    let by_itself = free && !facts.is_crash_loop() && facts.named().is_none();
-    rule(
-        "without autostart there is none",
-        by_itself && facts.autostart().is_empty(),
-        reason == Reason::NoAutostart,
-    );
-    rule(
-        "two resets keep the device from a start",
-        reason == Reason::TwoResets,
-        facts.pin_resets() == 2 && facts.starts().is_some(),
-    );
-
+    let is_free = !facts.wants_bootloader() && !ended;
     let waiting = facts.starts().filter(|_| facts.pin_resets() < 2);
-    rule("what is held back is the program whose turn it is", true, held == waiting.unwrap_or(0));
-    rule("the window is that of the program", held > 0, window_ms == facts.window(held));
-    rule(
-        "a window or a compaction holds it back",
-        held > 0,
-        reason == if window_ms > 0 { Reason::Rescue } else { Reason::Compaction }
-            && (window_ms > 0 || facts.is_compacted()),
-    );
 
     // Why a program does not start.
-    let is_refused = free && !facts.is_crash_loop() && facts.starts().is_none();
+    let is_refused = is_free && !facts.is_crash_loop() && facts.starts().is_none();
     let tried: Vec<u8> = facts.named().map_or(facts.autostart().to_vec(), |number| vec![number]);
     let there =
         tried.iter().copied().find(|number| facts.program(*number) != Absent).or(tried.first().copied());
-    let is_in_range = facts.policy.node_ids.contains(&5);
     let (why, is_broken) = match there.map(|number| facts.program(number)) {
-        _ if !is_in_range => (Reason::NodeId, false),
-        None | Some(Absent) => (Reason::NoProgram, false),
+        None => (Reason::NoAutostart, false),
+        _ if !facts.policy.node_ids.contains(&5) => (Reason::NodeId, false),
+        Some(Absent) => (Reason::NoProgram, false),
         Some(OtherContents | TooLong) => (Reason::Damaged, true),
         Some(NoVectors) => (Reason::Vectors, true),
         Some(Unreleased) if !facts.asks(&[2, 9]) => (Reason::Unsigned, false),
         Some(Unreleased | Released | Confirmed) => (Reason::Forbidden, false),
     };
-    rule(
-        "what is wrong is that of the first program that is there",
-        is_refused && !tried.is_empty(),
-        reason == why,
-    );
-    let is_asked = facts.asks(&[2, 3, 9]);
-    let named = there.filter(|_| is_refused && (is_asked || is_broken)).unwrap_or(0);
-    rule("1F57h names what a client asked for, or what is damaged, and nothing else", true, refused == named);
+    let named = there.filter(|_| is_refused && (facts.asks(&[2, 3, 9]) || is_broken)).unwrap_or(0);
+    rules! { broken:
+        "who asks for the bootloader is named first"
+            if facts.asks(&[1, 7]) => reason == Reason::Requested;
+        "a fault is named"
+            if facts.asks(&[4]) && !ended => reason == Reason::Fault;
+        "a trial, and its end, are named"
+            if facts.asks(&[13]) || ended => reason == Reason::Renewal;
+        "the strap is named"
+            if facts.row.strap && !asked => reason == Reason::Strap;
+        "a crash loop is named, and is one"
+            if true => (reason == Reason::CrashLoop) == (is_free && facts.is_crash_loop());
+        "two resets are named, and keep the device from a start"
+            if true => (reason == Reason::TwoResets) == (facts.pin_resets() == 2 && facts.starts().is_some());
+        "what is held back is the program whose turn it is"
+            if true => held == waiting.unwrap_or(0);
+        "the window is that of the program"
+            if held > 0 => window_ms == facts.window(held);
+        "a window or a compaction holds it back"
+            if held > 0 => reason == if window_ms > 0 { Reason::Rescue } else { Reason::Compaction };
+        "nothing else holds it back"
+            if held > 0 => window_ms > 0 || facts.is_compacted();
+        "what is wrong is that of the first program that is there"
+            if is_refused => reason == why;
+        "1F57h names what a client asked for, or what is damaged, and nothing else"
+            if true => refused == named;
+    }
     broken
-}
-
-/// Each rule that the end of a trial breaks.
-fn broken_end(facts: &Facts, end: TrialEnd) -> Option<&'static str> {
-    let expected = match facts.row.cell {
-        _ if !facts.policy.renewal => TrialEnd::None,
-        (13, 2) => TrialEnd::Late,
-        (13, 3) => TrialEnd::GivenUp,
-        (13, 1) if facts.tries() && !facts.row.bootloader.staging_loads => TrialEnd::Damaged(Damage::Board),
-        _ if facts.trial_broke_off() => TrialEnd::Reset(facts.row.cause),
-        _ => TrialEnd::None,
-    };
-    (end != expected).then_some("the end of a trial is reported, and nothing else")
 }
 
 // --- the table
