@@ -2,7 +2,7 @@
 //!
 //! | module | what it does | knows |
 //! |---|---|---|
-//! | [`decision`] | bootloader or program, after every reset | records, no flash |
+//! | [`decision`] | what runs after a reset: a program, or the bootloader from which place | records and images, no object |
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
 //! | `unseal` | sealed images: authentic, deciphered, unpacked | the format, no object |
