@@ -65,7 +65,8 @@ pub unsafe fn check(flash: &ResidentFlash, place: Region) -> Result<VectorTable,
         return Err(Damage::Crc);
     }
     let vectors = (place.base + Header::SIZE) as *const [u32; 2];
-    // SAFETY: `check_contents` has found that the image, which is longer than two words, ends within its flash.
+    // SAFETY: `check_contents` has found that the image, which is longer than two words, ends
+    // within its flash.
     header.entry(unsafe { vectors.read_volatile() })
 }
 
@@ -74,9 +75,9 @@ pub unsafe fn check(flash: &ResidentFlash, place: Region) -> Result<VectorTable,
 /// # Safety
 /// [`check`] has found it good. Nothing may use the RAM except its last [`LEAST_STACK`] bytes.
 pub unsafe fn copy(place: Region) {
-    // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the stack its
-    // room, and has a multiple of four bytes; both addresses are aligned. The caller guarantees that nothing
-    // else uses the RAM.
+    // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the
+    // stack its room, and has a multiple of four bytes; both addresses are aligned. The caller
+    // guarantees that nothing else uses the RAM.
     unsafe {
         let header = header(place);
         let (from, to) = ((place.base + Header::SIZE) as *const u32, header.ram_base as *mut u32);

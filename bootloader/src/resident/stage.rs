@@ -1,7 +1,7 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
-//! It reads what is read once ([`take`]), makes the choice ([`boot_core::decision::choose`]), carries it out, and
-//! ends in [`enter_program`] or [`enter_bootloader`].
+//! It reads what is read once ([`take`]), makes the choice ([`boot_core::decision::choose`]),
+//! carries it out, and ends in [`enter_program`] or [`enter_bootloader`].
 //!
 //! Before it, nothing has used a peripheral. It uses only the reset flags, that of Standby among them, the
 //! warm-start cell, the watchdog, the power and the flash controller, the CRC unit and the entry strap, and leaves the
@@ -55,7 +55,7 @@ pub unsafe extern "C" fn stage() -> ! {
     // CRCs need speed, but no exact clock. The crystal would take time to start.
     Source::Internal.speed_up(&chip.rcc);
     ResidentFlash::switch_crc_unit_on(&chip.rcc);
-    // SAFETY: nothing else changes the register until it is dropped, but what restores it at its own end.
+    // SAFETY: what else changes the register until it is dropped restores it at once.
     let caches = unsafe { Caches::on() };
 
     let (choice, parameters) = loop {
@@ -111,8 +111,8 @@ unsafe fn chip() -> Chip {
     chip
 }
 
-/// Reads what is read once, and removes it, so that no later reset reads it again. Does not return after a jump that
-/// left more than a reset does, and if the request is for the loader in the ROM.
+/// Reads what is read once, and removes it, so that no later reset reads it again. Does not return
+/// after a jump that left more than a reset does, and if the request is for the loader in the ROM.
 fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
     let status = rcc.csr().read();
     // SAFETY: it removes the flags, and leaves the LSI as it is.
@@ -137,8 +137,8 @@ fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
         is_marked,
         strap: bsp::entry_strap(),
         ended: if PRODUCT.renewal { ended(cause) } else { None },
-        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. Nothing has
-        // written it since the program started.
+        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
+        // Nothing has written it since the program started.
         program: unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) },
         node_id: NO_NODE_ID,
         bit_rate: BitRate::Auto,
@@ -146,14 +146,14 @@ fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
     }
 }
 
-/// The origin of the RAM image that ran before this reset, by its report; `None` if a program ran, or the power
-/// failed: a short dip may leave the RAM as it was.
+/// The origin of the RAM image that ran before this reset, by its report; `None` if a program ran,
+/// or the power failed: a short dip may leave the RAM as it was.
 fn ended(cause: ResetCause) -> Option<Origin> {
     if matches!(cause, ResetCause::PowerOn | ResetCause::BrownOut) {
         return None;
     }
-    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image; nothing else
-    // runs.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image;
+    // nothing else runs.
     let words = unsafe { (LAYOUT.handoff.base as *const Words).read_volatile() };
     BootReport::parse(&words).map(|report| of_word(report.renewal).0)
 }
@@ -168,7 +168,8 @@ fn images(flash: &ResidentFlash) -> Images<impl Fn(Region) -> Result<VectorTable
     Images { home, staging, check: |place| unsafe { ram_image::check(flash, place) } }
 }
 
-/// Stores a value, if the supply is good enough for the journal. What is not stored is lost, and the start continues.
+/// Stores a value, if the supply is good enough for the journal. What is not stored is lost, and
+/// the start continues.
 fn store(value: Store, woken: &Woken, parameters: &mut Parameters, flash: &mut ResidentFlash) {
     if bsp::supply::state() == Supply::Low {
         return;
@@ -181,8 +182,8 @@ fn store(value: Store, woken: &Woken, parameters: &mut Parameters, flash: &mut R
     }
 }
 
-/// Marks the first reset by the pin, and gives the second one its time. A watchdog of the option bytes does not bite
-/// meanwhile: it has its longest time.
+/// Marks the first reset by the pin, and gives the second one its time. A watchdog of the option
+/// bytes does not bite meanwhile: it has its longest time.
 fn await_second_reset(cell: &mut Cell) {
     let core = Source::Internal.tree().sysclk();
     bsp::pause(core, PinReset::BOUNCE_MS);
@@ -212,9 +213,8 @@ unsafe fn enter_rom(rcc: &pac::RCC) {
 
 /// Enters the RAM image in a place, with a report of what is left for it.
 ///
-/// # Safety
-/// The image must be good ([`ram_image::check`]). No interrupt may be enabled, no bus master started, and only the
-/// stack may use the RAM.
+/// # Safety The image must be good ([`ram_image::check`]). No interrupt may be enabled, no bus
+/// master started, and only the stack may use the RAM.
 // One call: without a function of its own it is shorter.
 #[inline(always)]
 unsafe fn enter_bootloader(
@@ -233,8 +233,8 @@ unsafe fn enter_bootloader(
         bsp::watchdog::start(&chip.iwdg, ms);
     }
     // The image changes the clock. The CRC unit keeps its clock, for the services.
-    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The caller
-    // guarantees the rest.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The
+    // caller guarantees the rest.
     unsafe {
         (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
         vectors.jump()
@@ -269,8 +269,8 @@ unsafe fn enter_program(
     } else if has_watchdog {
         bsp::watchdog::rescale(&chip.iwdg, bsp::watchdog::AFTER_RESET);
     }
-    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The caller
-    // guarantees the rest.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The
+    // caller guarantees the rest.
     unsafe {
         handoff.write(LAYOUT.handoff.base as *mut Handoff);
         start.vectors.jump()

@@ -31,8 +31,8 @@ pub struct Woken {
     pub is_marked: bool,
     /// The entry strap asks for the bootloader.
     pub strap: bool,
-    /// The origin of the RAM image that this reset has ended; `None` if a program ran, if the power failed, or if
-    /// the bootloader cannot be renewed.
+    /// The origin of the RAM image that this reset has ended; `None` if a program ran, if the power
+    /// failed, or if the bootloader cannot be renewed.
     pub ended: Option<Origin>,
     /// The program that ran before this reset, as the handoff says; 0 for none.
     pub program: u8,
@@ -75,7 +75,8 @@ impl Woken {
         }
     }
 
-    /// How a trial has ended by this reset, if the image that ran was on trial. A confirmed one is not.
+    /// How a trial has ended by this reset, if the image that ran was on trial. A confirmed one is
+    /// not.
     fn trial_end(&self, record: Option<RenewalRecord>) -> TrialEnd {
         let is_staged = record.is_some_and(|record| record.state == State::Staged);
         match self.request {
@@ -190,7 +191,8 @@ pub struct Choice<I> {
 /// A value that the boot stage stores.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Store {
-    /// What the request of a sealed program asks for: it could not store that itself, because the flash was locked.
+    /// What the request of a sealed program asks for: it could not store that itself, because the
+    /// flash was locked.
     Asked,
     /// The new number of consecutive crash resets.
     CrashCount(u32),
@@ -311,8 +313,8 @@ impl Autostart {
     }
 }
 
-/// A product, as far as the boot stage knows it. That of a device has constants, and the compiler leaves out what it
-/// does not have.
+/// A product, as far as the boot stage knows it. That of a device has constants, and the compiler
+/// leaves out what it does not have.
 pub trait Product: Copy {
     /// Its choices.
     fn policy(&self) -> &Policy;
@@ -358,7 +360,8 @@ pub struct Policy {
 const MOST_CRASHES: u32 = 255;
 
 impl Policy {
-    /// Each program starts by itself, at once, after fewer than three crashes; nothing else is chosen.
+    /// Each program starts by itself, at once, after fewer than three crashes; nothing else is
+    /// chosen.
     #[must_use]
     pub const fn plain(layout: &'static Layout, programs: &'static [u8]) -> Self {
         Self {
@@ -530,8 +533,8 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
         decision
     }
 
-    /// The program that starts if there is no bootloader to stay in, neither for the entry strap nor for the reset
-    /// pin or a rescue window: one with autostart, or any other one.
+    /// The program that starts if there is no bootloader to stay in, neither for the entry strap
+    /// nor for the reset pin or a rescue window: one with autostart, or any other one.
     fn any(&self) -> Option<Start> {
         let Policy { autostart, programs, .. } = *self.product.policy();
         let start = |number: &u8| {
@@ -578,8 +581,9 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
         }
     }
 
-    /// How long the start of a program is held back, in ms. A requested start is not: the requesting master asks
-    /// for the program at once, and this request would keep the device in the bootloader.
+    /// How long the start of a program is held back, in ms. A requested start is not: the
+    /// requesting master asks for the program at once, and this request would keep the device in
+    /// the bootloader.
     fn rescue_window(&self, request: Option<BootRequest>, program: &VerifiedProgram) -> u16 {
         match request {
             None if program.confirmed() => self.product.policy().rescue_window_confirmed_ms,

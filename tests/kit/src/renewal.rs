@@ -118,8 +118,8 @@ pub fn load(flash: &impl Flash, place: Region, host: Host) -> Result<Header, Dam
     check_contents(flash, place, &header, &LAYOUT, host).map(|()| header)
 }
 
-/// The image that the boot stage loads after a reset with this request, if it stays in the bootloader; `None` if it can
-/// load none.
+/// The image that the boot stage loads after a reset with this request, if it stays in the
+/// bootloader; `None` if it can load none.
 pub fn loads(
     flash: &impl Flash,
     layout: &Layout,

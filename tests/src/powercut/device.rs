@@ -47,8 +47,8 @@ static LOCKED_LIFT: Config = Config {
     ..STANDARD_2.config
 };
 
-/// The exit of the boot stage in these tests: program 1 starts by itself, there is no rescue window, and the bootloader
-/// is whole.
+/// The exit of the boot stage in these tests: program 1 starts by itself, there is no rescue
+/// window, and the bootloader is whole.
 pub fn exit(
     flash: &impl Flash,
     parameters: &impl Parameters,

@@ -1,5 +1,5 @@
-//! The choice of the boot stage: a table of all that it may find, against rules that say what a device never
-//! does, and what it always does.
+//! The choice of the boot stage: a table of all that it may find, against rules that say what a
+//! device never does, and what it always does.
 
 use std::task::Poll;
 
@@ -68,7 +68,8 @@ struct Row {
 
 const CAUSES: [ResetCause; 9] =
     [PowerOn, BrownOut, Standby, Pin, Software, IndependentWatchdog, WindowWatchdog, LowPower, Unknown];
-/// docs/protocol.md: none, the mark, each request; 15, 17: none for this version. 0x0505: node-ID 5, 25 kbit/s.
+/// docs/protocol.md: none, the mark, each request; 15, 17: none for this version. 0x0505: node-ID
+/// 5, 25 kbit/s.
 const CELLS: [(u32, u32); 25] = [
     (0, 0),
     (0, 1),
