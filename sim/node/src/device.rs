@@ -263,6 +263,10 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let Idle { mut flash, buffer } = idle;
         let mut journal = Journal::open(&flash, config.layout.parameters);
         let node = NodeParameters::load(&journal, &flash, node, supports);
+        // Its stand-ins may erase, since no core stalls: a journal that is nearly full holds no program back.
+        if journal.is_nearly_full() && journal.compact(0) {
+            let _ = run(&mut flash, |flash, outcome| journal.next(flash, outcome));
+        }
         let policy = Policy { crc: config.download.crc, ..Policy::plain(config.layout, &PROGRAM_NUMBERS) };
         let woken = Woken { cause, request, strap, ..Woken::power_on(node.id_or_none(), node.bit_rate) };
         let choice = choose(&woken, &Images::SOUND, &flash, &journal, &policy);

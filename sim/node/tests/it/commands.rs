@@ -7,6 +7,10 @@ use std::process::Command;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::Duration;
 
+use boot_core::store::{Journal, Parameters as _};
+use coboot_node::file_flash::{FileFlash, Speed};
+use shared_abi::layout::DEFAULT;
+
 use crate::bus::{Coflash, Folder, Nodes};
 use serde_json::{json, Value};
 
@@ -64,6 +68,23 @@ fn the_steps_of_an_update_one_by_one() {
     assert_ne!(coflash.json(&["status", "-N", "5"])["status"]["error"], Value::Null);
     assert_eq!(coflash.json(&["status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
     assert_eq!(on(&["reset"]), "back on the bus: node 5\n");
+}
+
+/// A chip holds the program back for its bootloader to make room; a node makes room itself.
+#[test]
+fn a_node_whose_journal_is_nearly_full_starts_its_program() {
+    let folder = folder("full");
+    let options = ["--node", "5", "--flash", "instant", "--stand-in"];
+    let nodes = Nodes::start(&folder, &options);
+    Coflash::new(&folder, &nodes).done(&[FLASH, &["-N", "5"]].concat());
+    drop(nodes);
+    let mut flash = FileFlash::open(&folder.path("1.flash"), DEFAULT, Speed::Instant).unwrap();
+    while !Journal::open(&flash, DEFAULT.parameters).is_nearly_full() {
+        kit::rig::fill_journal(&mut flash, DEFAULT, 2);
+    }
+    flash.save().unwrap();
+    let nodes = Nodes::start(&folder, &options);
+    nodes.await_line("serial 1, node 5: would start program 1");
 }
 
 /// The erase of a program on flash with realistic times.
