@@ -54,7 +54,7 @@ const RULES: &[(&str, &str)] = &[
     ("coboot-node", "boot-core canopen coboot-app coboot-can coflash-agent coflash-conform coflash-core shared-abi kit"),
     // Its command line reads memory maps.
     ("emulator", "coboot-linker shared-abi"),
-    (KIT, "boot-core canopen coboot-app coboot-can shared-abi"),
+    (KIT, "boot-core canopen coboot-app coboot-can seal shared-abi"),
     (
         "coboot-tests",
         "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",

@@ -18,7 +18,7 @@ const BOOT_CORE: &[Rule] = &[
     ("sequence", "flash"),
     ("store", "crc flash resume sequence"),
     ("program", "crc flash keys store"),
-    ("decision", "program"),
+    ("decision", "crc flash program renewal store"),
     ("keys", "flash store"),
     ("queue", "session"),
     ("refusal", ""),
