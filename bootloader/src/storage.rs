@@ -98,14 +98,18 @@ impl Flash for BootFlash {
 }
 
 /// The stored values.
-pub struct Store(&'static mut StoreState);
+pub struct Store {
+    state: &'static mut StoreState,
+    /// A value that came while the flash may have worked: the next call of [`next`](Parameters::next) takes it.
+    waiting: Option<(Key, Value)>,
+}
 
 impl Store {
     /// Finds the stored values. The flash must be idle.
     pub fn open(state: &'static mut StoreState) -> Self {
         // SAFETY: no other code uses the state.
         unsafe { (services().open)(state) };
-        Self(state)
+        Self { state, waiting: None }
     }
 }
 
@@ -127,20 +131,24 @@ impl Parameters for Store {
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.
-        unsafe { ((services().get)(&*self.0, key.0, &mut value) != 0).then_some(value) }
+        unsafe { ((services().get)(&*self.state, key.0, &mut value) != 0).then_some(value) }
     }
 
     fn store(&mut self, key: Key, value: Value) {
-        // SAFETY: the state comes from `open`.
-        unsafe { (services().store)(&mut *self.0, key.0, &value) };
+        // The journal may be being erased: a service would stop the core until the end of that.
+        self.waiting = Some((key, value));
     }
 
     fn compact(&mut self, used: u32) -> bool {
         // SAFETY: the state comes from `open`.
-        unsafe { (services().compact)(&mut *self.0, used) != 0 }
+        unsafe { (services().compact)(&mut *self.state, used) != 0 }
     }
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
+        if let Some((key, value)) = self.waiting.take() {
+            // SAFETY: the state comes from `open`.
+            unsafe { (services().store)(&mut *self.state, key.0, &value) };
+        }
         let result = match outcome {
             Ok(()) => OperationResult::Done,
             Err(FlashFault::Protected) => OperationResult::Protected,
@@ -150,7 +158,7 @@ impl Parameters for Store {
         };
         let mut operation = [0; 4];
         // SAFETY: the state comes from `open`, and the words are writable.
-        let step = unsafe { (services().next)(&mut *self.0, result as u32, &mut operation) };
+        let step = unsafe { (services().next)(&mut *self.state, result as u32, &mut operation) };
         match (Step::from_number(step), operation) {
             (Step::Start, [ERASE, place @ ..]) => Next::Start(Operation::Erase(sector(place))),
             (Step::Start, [_, address, word, _]) => Next::Start(Operation::Program { address, word }),

@@ -375,3 +375,26 @@ fn frames_lost_in_a_flood_are_told_once() {
     while bench.receive(Duration::ZERO).unwrap().is_some() {}
     assert!(is_bootloader(&mut bench.session()));
 }
+
+/// Code in flash stops while the journal is erased (RM0090 section 3.5.1), and the watchdog with it.
+#[test]
+fn a_value_that_comes_while_the_journal_is_erased_does_not_stop_the_core() {
+    for ms in [30, 100, 200] {
+        let mut bench = empty_board();
+        store(&mut bench, NODE, BitRate::K125);
+        // From 256 used places on it is compacted at once.
+        bench.fill_journal(300);
+        restart(&mut bench);
+        bench.run_ms(ms);
+        configuration_state(&mut bench);
+        bench.post(LSS_REQUEST, &[0x11, 9, 0, 0, 0, 0, 0, 0]);
+        bench.run_ms(5);
+        bench.post(LSS_REQUEST, &[0x17, 0, 0, 0, 0, 0, 0, 0]);
+        bench.run_ms(500);
+        assert_eq!(bench.machine().counters().flash_stalls, 0, "{ms} ms");
+        restart(&mut bench);
+        let from = bench.time();
+        bench.run_ms(50);
+        assert!(boot_up(&bench, 9, from).is_some(), "{ms} ms: it is stored");
+    }
+}
