@@ -233,9 +233,12 @@ fn renewed(board: &Layout, variant: &Variant) -> Outcome {
     let (elf, stamp) = (elf_of(board, variant.name), elf_of(board, variant.name).with_extension("built"));
     let program = std::env::current_exe().map_err(|error| format!("this program has no path: {error}"))?;
     if elf.exists() && stamp.exists() {
-        // A folder changes when a file in it goes.
+        // A folder changes when a file in it goes. This program itself may have been linked anew since it began: its
+        // old file has no name any more.
         let mut find = Command::new("find");
-        find.current_dir(workspace::root()).args(SOURCES.split(' ')).arg(program);
+        find.current_dir(workspace::root())
+            .args(SOURCES.split(' '))
+            .args(Some(program).filter(|it| it.exists()));
         if process::output(find.arg("-newer").arg(&stamp).args(["-print", "-quit"]))?.is_empty() {
             return report(&elf, &variant.regions(board));
         }
