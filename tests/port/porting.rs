@@ -439,7 +439,7 @@ const PRODUCTS: &[(&str, &str)] = &[
     ("node_ids: 10..=20", "node_ids is without the node-ID of a new device"),
     ("bit_rates: 0..=2", "bit_rates is without the bit rate of a new device"),
     // Its new devices have node-ID 64 at 125 kbit/s.
-    ("profile: Profile::ESACADEMY, node_ids: 1..=63", "node_ids is without the node-ID of a new device"),
+    ("profile: Profile::ESACADEMY, block_download: false, node_ids: 1..=63", "node_ids is without the node-ID of a new device"),
     ("max_crash_resets: 256", "max_crash_resets must be 255 or less"),
     ("crc_step: 65537", "crc_step must be 65536 bytes or less"),
     ("answer_to_reset_ms: 1001", "answer_to_reset_ms must be 1000 or less"),
