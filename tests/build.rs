@@ -1,10 +1,28 @@
-//! Makes the files of the bootloader's products modules of `src/products.rs`, with a list of them.
+//! Makes the files of the bootloader's products modules of `src/products.rs`, with a list of them, and says what the
+//! board under test has: a test that needs more names it as a `cfg`.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
+use shared_abi::layout::{self, stm32f407g_disc1};
+
 fn main() {
+    println!("cargo:rerun-if-env-changed=COBOOT_BOARD");
+    let board = layout::chosen(env::var("COBOOT_BOARD").ok().as_deref());
+    for (name, has) in [
+        // Room for images that are sealed, or with a log, the debugger or CAN over UART.
+        ("split_map", board.home.is_some()),
+        // A renewal of the bootloader.
+        ("staging", board.staging.is_some()),
+        // Pages, guides and the projects that they describe are for one board.
+        ("reference_board", board.board == stm32f407g_disc1::LAYOUT.board),
+    ] {
+        println!("cargo:rustc-check-cfg=cfg({name})");
+        if has {
+            println!("cargo:rustc-cfg={name}");
+        }
+    }
     let folder = Path::new(&env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it"))
         .join("../bootloader/products")
         .canonicalize()

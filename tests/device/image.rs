@@ -524,6 +524,7 @@ const BY_FACTS_OF: [&str; 7] = [
 
 /// Each image on each resident part, as the running bootloader and the resident part judge its header.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn an_image_is_for_the_resident_parts_with_its_facts_alone() {
     let board = firmware::board();
     let rows = BY_FACTS_OF.iter().enumerate();
@@ -546,6 +547,7 @@ fn an_image_is_for_the_resident_parts_with_its_facts_alone() {
 /// The resident part stays in the field while RAM images come and go: an image in which every address differs
 /// runs on it, and calls its services.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
     if firmware::board().home.is_none() {
         // In the compact map the two are one, written together.

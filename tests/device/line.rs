@@ -181,6 +181,7 @@ fn found_after(bench: &mut Bench, within_ms: u64) -> Option<Span> {
 }
 
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
     for rate in [1_000_000, 250_000, 50_000] {
         let mut bench = empty_board();
@@ -204,6 +205,7 @@ fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
 }
 
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
     for rate in [1_000_000, 250_000, 20_000] {
         let mut bench = empty_board();
@@ -221,6 +223,7 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
 }
 
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn an_application_finds_the_bit_rate_too() {
     let mut bench = empty_board();
     bench.install(firmware::APP_V1);
@@ -341,6 +344,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
 }
 
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn frames_lost_in_a_flood_are_told_once() {
     // It computes a CRC of 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
     let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16).switched_on();

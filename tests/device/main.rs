@@ -7,6 +7,7 @@ mod bus;
 mod c_application;
 mod contention;
 mod crystal;
+#[cfg(split_map)]
 mod debugger;
 mod device;
 mod handover;
@@ -14,21 +15,25 @@ mod hostile_bus;
 mod image;
 mod leftovers;
 mod line;
+#[cfg(split_map)]
 mod log;
 mod mute;
 mod nameplate;
 mod options;
 mod program_control;
 mod reentry;
+#[cfg(staging)]
 mod renewal;
 mod silicon;
 mod slcan;
+#[cfg(split_map)]
 mod software_date;
 mod stack;
 mod standby;
 mod stuck_bus;
 mod supply;
 mod uart;
+#[cfg(split_map)]
 mod virtual_can;
 mod watchdog;
 mod ways_in;

@@ -514,6 +514,7 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
 /// To an application the bootloader is one more program, which does not run: a master reads there which
 /// one a device has, and each command leads to it.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn the_bootloader_is_a_program_of_the_application_too() {
     let number = renewal::number();
     let new = renewal::image_of(firmware::BOOTLOADER);

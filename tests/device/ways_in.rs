@@ -145,6 +145,7 @@ fn the_wait_leaves_the_system_timer_as_after_a_reset() {
 
 /// A damaged RAM image is no bootloader to stay in: the program starts as always.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn two_resets_without_a_bootloader_start_the_program() {
     let mut bench = running_board(firmware::BOOTLOADER_WAYS_IN);
     let home = firmware::board().home.expect("the split map");

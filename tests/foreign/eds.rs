@@ -120,6 +120,7 @@ fn python_canopen_finds_the_bootloader_as_its_file_says() {
 
 /// A lift refuses 1F51h until it is unlocked, so its values are not compared.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn python_canopen_finds_other_products_as_their_files_say() {
     for (name, product, sealed) in [
         (firmware::BOOTLOADER_SEALED, "default", true),
@@ -199,6 +200,7 @@ fn board_with(name: &str) -> (Bench, u8) {
 /// The products with other objects than the default one: passwords, sealed images, the loader in the ROM, and
 /// one without all that it may leave out.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn each_product_has_the_objects_of_its_file_and_no_others() {
     for (name, product, sealed) in [
         (firmware::BOOTLOADER_SEALED, "default", true),
@@ -218,6 +220,7 @@ fn each_product_has_the_objects_of_its_file_and_no_others() {
 
 /// What the files of these products leave out, by the meaning of the choices (docs/product.md).
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn a_file_has_no_object_that_the_product_leaves_out() {
     let has = |product, index| {
         let image = eds::bootloader_of(product, false).expect("a product of the repository");

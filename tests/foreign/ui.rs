@@ -1,6 +1,7 @@
 //! Tests of `coflash ui` in a real Chromium, which tests/python/ui_page.py controls: with nodes
 //! (`coboot-node`) that the script starts, and with the emulated board.
 
+#[cfg(reference_board)]
 mod machine;
 
 use std::env;

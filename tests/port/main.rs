@@ -2,5 +2,7 @@
 
 mod can2;
 mod can_driver;
+#[cfg(split_map)]
 mod matrix;
+#[cfg(reference_board)]
 mod porting;

@@ -197,6 +197,7 @@ fn a_sealed_program_that_jumps_back_can_be_updated() {
 
 /// The manifest says that the application writes to flash itself.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn a_sealed_program_that_writes_flash_is_not_locked_out() {
     let file = Sealer { writes_flash: true, ..sealer(COUNTER) }.seal(&program(), &release()).unwrap();
     let mut bench = installed(board_of(firmware::BOOTLOADER_SEALED_WRITES_FLASH), &file);

@@ -1,10 +1,12 @@
 //! Sealed images, on the model of the flash and on the emulated chip.
+#![cfg(split_map)]
 
 mod access;
 mod attacker;
 mod blocks;
 mod client;
 mod confirmation;
+#[cfg(staging)]
 mod conform;
 mod device;
 mod dictionary;
@@ -14,5 +16,6 @@ mod pieces;
 mod powercut;
 mod provisioning;
 mod refusals;
+#[cfg(staging)]
 mod renewal;
 mod strangers;

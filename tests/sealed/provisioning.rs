@@ -23,6 +23,7 @@ fn only_the_bootloader_for_sealed_images_gets_keys() {
 
 /// With renewal the home of the RAM image (sector 4) has to stay writable.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn a_bootloader_that_can_be_renewed_leaves_its_home_writable() {
     for (name, mask) in [(firmware::BOOTLOADER_SEALED, 0b0_0001), (firmware::BOOTLOADER_LEAST, 0b1_0001)] {
         let loaded = load(&firmware::dir().join(name), None, None);

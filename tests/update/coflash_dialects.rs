@@ -57,6 +57,7 @@ fn power_cycle(bench: &mut Bench, node: u8) {
 }
 
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn images_and_intel_hex_update_the_standard_firmware() {
     for dialect in [Dialect::Raw, Dialect::Hex] {
         let mut bench = Bench::new().switched_on();

@@ -284,6 +284,7 @@ fn a_device_with_flash_that_cannot_be_erased_fails_alone() {
 
 /// The bootloader of the board with two programs has less room for the first one.
 #[test]
+#[cfg_attr(not(reference_board), ignore = "needs the stm32f407g-disc1")]
 fn a_device_without_room_refuses_alone() {
     let size = stm32f407g_disc1_two::LAYOUT.programs[0].size / 1024 + 1;
     let error = assert_refuses_alone(
@@ -339,6 +340,7 @@ fn erases(bench: &mut Bench, place: usize) -> usize {
 
 /// The first device shows whether the new bootloader is good: without it the others stay as they are.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn if_the_first_device_refuses_a_bootloader_the_others_are_left_alone() {
     let (mut bench, exit, said) = renewed(1);
     assert_eq!(exit, Some(8), "{said}");
@@ -355,6 +357,7 @@ fn if_the_first_device_refuses_a_bootloader_the_others_are_left_alone() {
 
 /// A later device is named, and the others are renewed.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn a_later_device_that_refuses_a_bootloader_is_named_and_the_others_are_renewed() {
     let (mut bench, exit, said) = renewed(5);
     assert_eq!(exit, Some(8), "{said}");

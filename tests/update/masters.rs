@@ -188,6 +188,7 @@ fn assert_renewed(bench: &mut Bench, image: &[u8]) {
 /// Zephyr's runner with `--program-number` of the bootloader. Its own confirmation, 80h, changes nothing
 /// here: without 83h the old bootloader is back after 60 s.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn zephyrs_runner_renews_a_bootloader_with_one_request_more() {
     let image = version(firmware::BOOTLOADER, NEW);
     for is_confirmed in [true, false] {
@@ -209,6 +210,7 @@ fn zephyrs_runner_renews_a_bootloader_with_one_request_more() {
 /// SYS TEC's tools write 83h directly after the data. It is acknowledged and changes nothing; the second one,
 /// after the boot-up, confirms.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn systecs_order_renews_a_bootloader_with_a_second_83h() {
     let image = version(firmware::BOOTLOADER, NEW);
     let home = firmware::board().home.unwrap().base;

@@ -80,6 +80,7 @@ fn a_point_of_the_board_is_written_and_read() {
 
 /// The same in a renewal: home is erased before the record says that staging is confirmed.
 #[test]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn a_cut_shows_a_home_that_is_erased_too_early() {
     let scenario = scenarios().find(|scenario| scenario.name == "renewal").unwrap();
     let mut story = scenario.story().unwrap();

@@ -37,6 +37,7 @@ fn board_at_1_mbit(options: Options) -> Bench {
 /// A master that only supports CiA 302-3: clear, one download, and 1F51h = 2 directly after it,
 /// without reading 1F57h.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn a_program_in_one_download_starts_by_reset_program() {
     let raw = throughput::program(20);
     let hex = intel_hex(firmware::board().programs[0].base, &raw).into_bytes();

@@ -29,6 +29,7 @@ fn the_host_tool_saturates_the_bus_at_1_mbit() {
 /// At 500 kbit/s a sealed and compressed program is verified in the device in less time than the
 /// raw one takes on the wire.
 #[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn a_compressed_program_is_faster_than_the_wire_of_the_raw_one() {
     let measured = measure_form(BitRate::K500, 256, Form::Compressed);
     assert!(measured.took < measured.wire, "{measured:?}");

@@ -2,7 +2,7 @@
 //!
 //! | file | what it does |
 //! |---|---|
-//! | `plan.rs` | which test runs when, and with which images |
+//! | `plan.rs` | the images of a tier, and what it needs on the machine |
 //! | `runner.rs` | builds and runs tests by cargo-nextest, and sums up |
 
 use std::sync::atomic::Ordering;
@@ -22,7 +22,7 @@ mod plan;
 mod runner;
 
 pub const HELP: &str = "\
-usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | --list | WORDS]
+usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | WORDS]
 
 Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
@@ -31,7 +31,6 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --all           every test: the two above, those that take minutes, and jobs of the night; it says what it
                   does not run
   --part NAME     with --all: this part alone; --all lists the names at its beginning. K/N is the K-th of N
-  --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   WORDS           go to cargo test, after the images are built: `cargo xtask test -p coboot-tests line::`
 ";
@@ -57,10 +56,6 @@ const ROOM: u64 = 5 << 20;
 
 pub fn run(mut args: Args) -> Outcome {
     let chosen_board = workspace::chosen_board(&mut args)?;
-    if args.flag("--list") {
-        println!("{}", plan::table(plan::LATER));
-        return args.none_left();
-    }
     let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
     let part = args.value("--part")?;
     let words = args.rest();
@@ -226,15 +221,15 @@ fn of_default(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         programs
     })?;
-    programs.iter().try_for_each(|of| runner::run(of, &tier.filter(), "", &variables(DEFAULT), summary))
+    programs.iter().try_for_each(|of| runner::run(of, tier.filter(), "", &variables(DEFAULT), summary))
 }
 
 /// What `.ci/run` adds.
 fn ci(summary: &mut Summary) -> Outcome {
     of_default(Tier::Ci, &["xtask"], summary)?;
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
-    let core = plan::any_of(["coboot-core/it", "coboot-attack/lives"]);
-    let core = format!("({core}) & ({})", Tier::Product.filter());
+    let core =
+        format!("(package(coboot-core) + package(coboot-attack)) & kind(test) & {}", Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
     runner::run(&workspace::on_host(), &core, "[sealed] ", &takes_sealed, summary)?;
     let mut doc = process::cargo("test --doc --quiet");
@@ -266,13 +261,12 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
         build::boards(&[(board, "")])?;
         programs_of_ours()?;
     }
-    let (programs, tests) = match tier {
+    let (programs, filter) = match tier {
         Tier::All => ("device update sealed foreign port", "all()".to_owned()),
-        _ => ("device update", format!("({}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter())),
+        _ => ("device update", format!("({OF_EACH_CHIP}) - {}", Tier::All.filter())),
     };
     let programs = programs.split(' ').map(|name| format!("--test={name}"));
     let arguments: Vec<_> = workspace::on_host().into_iter().chain(programs).collect();
-    let filter = format!("({tests}) - ({})", plan::any_of(plan::left_out(board)));
     runner::run(&arguments, &filter, &format!("[{}] ", board.board), &variables(board), summary)
 }
 

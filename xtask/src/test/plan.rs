@@ -1,5 +1,4 @@
-//! Which test runs when, and with which images. docs/testing.md has the table of what does not run in every
-//! `cargo xtask test`, with the reasons.
+//! What runs when needs: the images, and what is installed. `.config/nextest.toml` says which test that is.
 
 use shared_abi::layout::{
     nucleo_f446re, stm32f407g_disc1, stm32f407g_disc1_can2, stm32f407g_disc1_two, stm32f429i_disc1, Layout,
@@ -16,29 +15,6 @@ pub enum Tier {
     Ci,
     /// `cargo xtask test --all`: what takes minutes, or builds programs of its own.
     All,
-}
-
-/// The page with the tables of tests.
-const PAGE: &str = include_str!("../../../docs/testing.md");
-/// The head of the table of the tests that do not run in every `cargo xtask test`: a row has the beginning of tests' paths,
-/// the first run that has them and why it is not an earlier one.
-pub const LATER: &str = "| tests | first run by |";
-
-/// The table of the page with this head.
-pub fn table(head: &str) -> &'static str {
-    let begin = PAGE.find(head).expect("docs/testing.md has the table");
-    PAGE[begin..].split("\n\n").next().unwrap_or_default()
-}
-
-/// The rows of [`LATER`]: the beginning of `program::path` of tests, and their tier.
-fn later() -> impl Iterator<Item = (&'static str, Tier)> {
-    table(LATER).lines().skip(2).map(|row| match row.split('`').collect::<Vec<_>>()[..] {
-        ["| ", tests, " | ", ".ci/run", _why] => (tests, Tier::Ci),
-        ["| ", tests, " | ", "--all", _why] => (tests, Tier::All),
-        _ => panic!(
-            "docs/testing.md: a row is | `TESTS` | `.ci/run` or `--all` | why not earlier |, not {row}"
-        ),
-    })
 }
 
 /// The images of a board that the tests of a tier need.
@@ -68,23 +44,10 @@ pub const IMAGES: &[Images] = &[
     Images { tier: Tier::All, board: &stm32f407g_disc1_two::LAYOUT, names: "" },
 ];
 
-/// Tests that run for a board of each chip in [`Tier::Ci`]: they show the mistakes that a port can
+/// Tests that run for a board of each chip in [`Tier::Ci`], as a filter of nextest: they show the mistakes that a port can
 /// have. The rest is the same on all chips; in [`Tier::All`] every test of these programs runs.
-pub const OF_EACH_CHIP: [&str; 5] =
-    ["device::device::", "device::watchdog::", "device::abi::", "device::handover::", "update::main_job::"];
-
-/// The tests that a board leaves out, for they need what it does not have: the page has a table of them.
-pub fn left_out(board: &Layout) -> impl Iterator<Item = &'static str> + '_ {
-    let row = |row: &'static str| row.split_once(" | ").expect("a row has two cells");
-    let rows = table("| a board with | tests |").lines().skip(2).map(row);
-    let is_missing = |(needed, _): &(&str, &str)| match *needed {
-        "| the split map" => board.home.is_none(),
-        "| a region for staging" => board.staging.is_none(),
-        "| the name stm32f407g-disc1" => board.board != stm32f407g_disc1::LAYOUT.board,
-        other => panic!("docs/testing.md: nobody knows which boards have this: {other}"),
-    };
-    rows.filter(is_missing).flat_map(|(_, tests)| tests.split('`').skip(1).step_by(2))
-}
+pub const OF_EACH_CHIP: &str =
+    "binary(device) & test(/^(abi|device|handover|watchdog)::/) | binary(update) & test(/^main_job::/)";
 
 impl Tier {
     /// What the tests up to this tier need on the machine.
@@ -97,63 +60,46 @@ impl Tier {
         }
     }
 
-    /// The tests that run first in this tier, as a filter of nextest.
-    pub fn filter(self) -> String {
-        // The first row that a test begins with has it: each one takes it from those after it.
-        let mut filter = if self == Self::Product { "all()" } else { "none()" }.to_owned();
-        for (tests, tier) in later().collect::<Vec<_>>().into_iter().rev() {
-            filter = format!("({filter}) {} {}", if tier == self { '+' } else { '-' }, of(tests));
+    /// The tests that run first in this tier, as a filter of nextest: by the groups of `.config/nextest.toml`.
+    pub fn filter(self) -> &'static str {
+        match self {
+            Self::Product => "group(@global)",
+            Self::Ci => "group(#ci*)",
+            Self::All => "group(#night*)",
         }
-        filter
     }
-}
-
-/// The tests whose `program::path` begins like this, as a filter of nextest. A program without a package is one of
-/// coboot-tests, or has the unit tests of a package.
-pub fn of(tests: &str) -> String {
-    let (program, path) = tests.split_once("::").unwrap_or((tests, ""));
-    let program = program.replace('/', "::");
-    format!("(binary_id(/^(coboot-tests::)?{program}(::bin.*)?$/) & test(/^{path}/))")
-}
-
-/// All of these tests, as a filter of nextest.
-pub fn any_of<'t>(tests: impl IntoIterator<Item = &'t str>) -> String {
-    tests.into_iter().fold("none()".to_owned(), |filter, tests| format!("{filter} + {}", of(tests)))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use crate::{files, workspace};
 
     #[test]
-    fn each_test_has_one_tier() {
-        let rows: Vec<_> = later().collect();
-        for (number, (tests, _)) in rows.iter().enumerate() {
-            let hides = rows[..number].iter().find(|(other, _)| tests.starts_with(other));
-            assert_eq!(hides, None, "{tests}");
+    fn each_group_of_tests_has_a_tier_and_is_on_the_page() {
+        let text = |name: &str| files::text(&workspace::root().join(name)).unwrap();
+        let (config, page) = (text(".config/nextest.toml"), text("docs/testing.md"));
+        let groups = config.lines().filter_map(|line| line.split_once(" = { max-threads"));
+        for (group, _) in groups.clone() {
+            assert!(["ci", "night"].contains(&group.split('-').next().unwrap()), "no tier runs {group}");
+            assert!(page.contains(&format!("`{group}`")), "docs/testing.md: {group}");
         }
-        let (first, last) = (of("device::application::"), of("xtask/hil::"));
-        assert_eq!(last, "(binary_id(/^(coboot-tests::)?xtask::hil(::bin.*)?$/) & test(/^/))");
-        for (tier, all, first_mark, last_mark) in [
-            (Tier::Product, "all()", '-', '-'),
-            (Tier::Ci, "none()", '-', '-'),
-            (Tier::All, "none()", '+', '+'),
-        ] {
-            let filter = tier.filter();
-            let rows = filter.trim_start_matches('(');
-            assert!(rows.starts_with(all) && rows.contains(&format!(" {last_mark} {last}")), "{filter}");
-            assert!(filter.contains(&format!(" {first_mark} {first}")), "{filter}");
-        }
-        assert!(Tier::Ci.filter().contains(&format!(" + {}", of("foreign::ui::"))));
+        assert!(groups.count() > 2);
     }
 
+    /// A filter that takes nothing any more would move a slow test into every run.
     #[test]
-    fn a_board_leaves_out_what_it_has_no_place_for() {
-        let out = |board: &Layout| left_out(board).collect::<Vec<_>>();
-        assert_eq!(out(&stm32f407g_disc1::LAYOUT), [""; 0]);
-        let compact = Layout { home: None, board: "another", ..stm32f407g_disc1::LAYOUT };
-        let out = out(&compact);
-        assert!(["sealed::", "port::porting::"].iter().all(|tests| out.contains(tests)), "{out:?}");
-        assert!(!out.contains(&"device::renewal::"), "{out:?}");
+    fn each_name_in_a_filter_of_tests_is_there() {
+        let root = workspace::root();
+        let sources =
+            ["coflash", "sim", "tests"].map(|folder| files::below(&root.join(folder), &["python"]).unwrap());
+        let sources =
+            sources.concat().into_iter().filter(|file| file.extension().is_some_and(|of| of == "rs"));
+        let sources: String = sources.map(|file| files::text(&file).unwrap()).collect();
+        let config = files::text(&root.join(".config/nextest.toml")).unwrap();
+        let filters = config.split("test(/^").skip(1).filter_map(|filter| filter.split("/)").next());
+        let names = filters.flat_map(|filter| filter.split(|c: char| !c.is_alphanumeric() && c != '_'));
+        for name in names.filter(|name| !name.is_empty()) {
+            assert!(["mod", "fn"].iter().any(|kind| sources.contains(&format!("{kind} {name}"))), "{name}");
+        }
     }
 }
