@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
-use self::plan::{Tier, IMAGES, OF_EACH_CHIP};
+use self::plan::{Tier, OF_EACH_CHIP};
 use self::runner::{Summary, Variables};
 use crate::args::Args;
 use crate::{
@@ -22,14 +22,13 @@ mod plan;
 mod runner;
 
 pub const HELP: &str = "\
-usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | WORDS]
+usage: cargo xtask test [--all [--part NAME] | --board BOARD | WORDS]
 
 Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
 
-  --ci            what .ci/run adds: Chromium, tools of others, the other chips, the pages
-  --all           every test: the two above, those that take minutes, and jobs of the night; it says what it
-                  does not run
+  --all           every test: also on the other chips, with the tools of others, those that take minutes, and
+                  jobs of the night; it says what it does not run
   --part NAME     with --all: this part alone; --all lists the names at its beginning. K/N is the K-th of N
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   WORDS           go to cargo test, after the images are built: `cargo xtask test -p coboot-tests line::`
@@ -39,12 +38,13 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
 type Stage = (&'static str, &'static str, u32, Tier, fn(&mut Summary) -> Outcome);
 
 /// All stages, in the order in which they run.
-const STAGES: [Stage; 5] = [
+const STAGES: [Stage; 6] = [
     ("product", "the default board, device and tool", 11, Tier::Product, product),
-    ("ci", "Chromium, tools of others, other chips, pages", 9, Tier::Ci, ci),
-    ("slow", "tests that take minutes", 30, Tier::All, slow),
-    ("boards", "every test with firmware, for each other chip", 30, Tier::All, boards),
-    ("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
+    ("chips", "other chips, two programs, sealed images", 5, Tier::Chips, chips),
+    ("pages", "Chromium, tools of others, the pages", 5, Tier::Pages, pages),
+    ("slow", "tests that take minutes", 30, Tier::Night, slow),
+    ("boards", "every test with firmware, for each other chip", 30, Tier::Night, boards),
+    ("jobs", "power cuts, attacker, QEMU, replay, all chips, two builds", 45, Tier::Night, jobs),
 ];
 
 /// What `--all` does not run.
@@ -56,16 +56,16 @@ const ROOM: u64 = 5 << 20;
 
 pub fn run(mut args: Args) -> Outcome {
     let chosen_board = workspace::chosen_board(&mut args)?;
-    let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
+    let all = args.flag("--all");
     let part = args.value("--part")?;
     let words = args.rest();
-    if for_ci && all || (for_ci || all) && (chosen_board.is_some() || !words.is_empty()) {
-        return Err("--ci and --all go with nothing else.".into());
+    if all && (chosen_board.is_some() || !words.is_empty()) {
+        return Err("--all goes with --part alone.".into());
     }
     if part.is_some() && !all {
         return Err("--part goes with --all.".into());
     }
-    let chosen = part.as_deref().or((!all).then_some(if for_ci { "ci" } else { "product" }));
+    let chosen = part.as_deref().or((!all).then_some("product"));
     let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| is_part(chosen, name));
     let stages: Vec<Stage> = STAGES.into_iter().filter(is_chosen).collect();
     if stages.is_empty() {
@@ -105,13 +105,12 @@ pub fn run(mut args: Args) -> Outcome {
         (Some(part), _) => format!("tests-all-{}", part.replace('/', "-of-")),
         (None, Some(board)) => format!("tests-{}", board.board),
         _ if all => "tests-all".into(),
-        _ if for_ci => "tests-ci".into(),
         _ => "tests".to_owned(),
     };
     evidence::begin(&name)?;
     let mut summary = Summary::default();
     if let Some(board) = chosen_board {
-        on_board(board, Tier::All, &mut summary)?;
+        on_board(board, Tier::Night, &mut summary)?;
     } else {
         for (name, about, _, _, run) in stages {
             println!("== {name}: {about}");
@@ -152,8 +151,8 @@ fn is_part(part: &str, stage: &str) -> bool {
 #[test]
 fn a_part_is_a_stage_or_the_kth_of_n() {
     let of = |part| STAGES.map(|(name, ..)| u8::from(is_part(part, name)));
-    assert_eq!(["slow", "1/4", "2/4"].map(of), [[0, 0, 1, 0, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 0]]);
-    assert_eq!(["0/4", "5/4", "1/0", "2/", "x"].map(of), [[0; 5]; 5]);
+    assert_eq!(["slow", "1/4", "2/4"].map(of), [[0, 0, 0, 1, 0, 0], [1, 0, 0, 0, 1, 0], [0, 1, 0, 0, 0, 1]]);
+    assert_eq!(["0/4", "5/4", "1/0", "2/", "x"].map(of), [[0; 6]; 5]);
 }
 
 /// Checks that the disk has room for a run from an empty folder, unless there are results already.
@@ -183,10 +182,9 @@ fn programs_of_ours() -> Outcome {
     process::run(cargo.args(workspace::on_host()).envs(variables(DEFAULT)).current_dir(workspace::root()))
 }
 
-/// Builds the images of a tier, and of those before it.
+/// Builds the images that a tier needs.
 fn build_images(tier: Tier) -> Outcome {
-    let rows: Vec<_> =
-        IMAGES.iter().filter(|row| row.tier <= tier).map(|row| (row.board, row.names)).collect();
+    let rows: Vec<_> = tier.images().map(|row| (row.board, row.names)).collect();
     build::boards(&rows)
 }
 
@@ -224,29 +222,35 @@ fn of_default(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
     programs.iter().try_for_each(|of| runner::run(of, tier.filter(), "", &variables(DEFAULT), summary))
 }
 
-/// What `.ci/run` adds.
-fn ci(summary: &mut Summary) -> Outcome {
-    of_default(Tier::Ci, &["xtask"], summary)?;
+/// Other chips, two programs and sealed images.
+fn chips(summary: &mut Summary) -> Outcome {
+    of_default(Tier::Chips, &[], summary)?;
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
     let core =
         format!("(package(coboot-core) + package(coboot-attack)) & kind(test) & {}", Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
     runner::run(&workspace::on_host(), &core, "[sealed] ", &takes_sealed, summary)?;
+    other_chips().try_for_each(|board| on_board(board, Tier::Chips, summary))
+}
+
+/// The browser, tools of others and the repository's pages.
+fn pages(summary: &mut Summary) -> Outcome {
+    of_default(Tier::Pages, &["xtask"], summary)?;
     let mut doc = process::cargo("test --doc --quiet");
     doc.current_dir(workspace::root()).args(workspace::on_host());
     summary.count("documentation", process::run(&mut doc));
-    other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
+    Ok(())
 }
 
 /// The tests that take minutes.
 fn slow(summary: &mut Summary) -> Outcome {
     examples::all()?;
-    of_default(Tier::All, &["xtask", "coboot-zencan"], summary)
+    of_default(Tier::Night, &["xtask", "coboot-zencan"], summary)
 }
 
 /// Every test that runs firmware, for each other chip.
 fn boards(summary: &mut Summary) -> Outcome {
-    other_chips().try_for_each(|board| on_board(board, Tier::All, summary))
+    other_chips().try_for_each(|board| on_board(board, Tier::Night, summary))
 }
 
 /// A board of each other chip.
@@ -257,13 +261,13 @@ fn other_chips() -> impl Iterator<Item = &'static Layout> {
 /// Tests that run firmware, with that of a board: all, or those that show the mistakes of a port. The
 /// programs are compiled for it.
 fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcome {
-    if tier == Tier::All {
+    if tier == Tier::Night {
         build::boards(&[(board, "")])?;
         programs_of_ours()?;
     }
     let (programs, filter) = match tier {
-        Tier::All => ("device update sealed foreign port", "all()".to_owned()),
-        _ => ("device update", format!("({OF_EACH_CHIP}) - {}", Tier::All.filter())),
+        Tier::Night => ("device update sealed foreign port", "all()".to_owned()),
+        _ => ("device update", format!("({OF_EACH_CHIP}) - {}", Tier::Night.filter())),
     };
     let programs = programs.split(' ').map(|name| format!("--test={name}"));
     let arguments: Vec<_> = workspace::on_host().into_iter().chain(programs).collect();

@@ -6,21 +6,23 @@ use shared_abi::layout::{
 
 use crate::setup::Part;
 
-/// When a test runs. Each tier contains the ones before it.
+/// When a test runs first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Tier {
     /// `cargo xtask test`: the product on its default board, device and tool.
     Product,
-    /// `.ci/run`: what needs a browser, tools of others, the other chips or the repository's pages.
-    Ci,
+    /// `.ci/run chips`: sealed images, two programs, and the other chips.
+    Chips,
+    /// `.ci/run pages`: what needs a browser, tools of others or the repository's pages.
+    Pages,
     /// `cargo xtask test --all`: what takes minutes, or builds programs of its own.
-    All,
+    Night,
 }
 
-/// The images of a board that the tests of a tier need.
+/// Images of a board that tests need.
 pub struct Images {
-    /// The first tier that needs them.
-    pub tier: Tier,
+    /// The tier that needs them; each one needs those of the product, and the night all.
+    tier: Tier,
     /// Their board.
     pub board: &'static Layout,
     /// Their names; empty for all of the board, and the applications in C.
@@ -34,29 +36,33 @@ const OF_A_CHIP: &str = "bootloader bootloader-paulus bootloader-watchdog app-v1
 const OF_TWO_PROGRAMS: &str =
     "bootloader bootloader-lift app-v1 app-v2 app-program-2 app-lift app-lift-v2 app-c";
 
-/// The images by tier.
-pub const IMAGES: &[Images] = &[
+static IMAGES: [Images; 6] = [
     Images { tier: Tier::Product, board: &stm32f407g_disc1::LAYOUT, names: "" },
     Images { tier: Tier::Product, board: &stm32f407g_disc1_can2::LAYOUT, names: "bootloader app-v1 app-v2" },
-    Images { tier: Tier::Ci, board: &stm32f407g_disc1_two::LAYOUT, names: OF_TWO_PROGRAMS },
-    Images { tier: Tier::Ci, board: &nucleo_f446re::LAYOUT, names: OF_A_CHIP },
-    Images { tier: Tier::Ci, board: &stm32f429i_disc1::LAYOUT, names: OF_A_CHIP },
-    Images { tier: Tier::All, board: &stm32f407g_disc1_two::LAYOUT, names: "" },
+    Images { tier: Tier::Chips, board: &stm32f407g_disc1_two::LAYOUT, names: OF_TWO_PROGRAMS },
+    Images { tier: Tier::Chips, board: &nucleo_f446re::LAYOUT, names: OF_A_CHIP },
+    Images { tier: Tier::Chips, board: &stm32f429i_disc1::LAYOUT, names: OF_A_CHIP },
+    Images { tier: Tier::Night, board: &stm32f407g_disc1_two::LAYOUT, names: "" },
 ];
 
-/// Tests that run for a board of each chip in [`Tier::Ci`], as a filter of nextest: they show the mistakes that a port can
-/// have. The rest is the same on all chips; in [`Tier::All`] every test of these programs runs.
+/// Tests that run for a board of each chip in [`Tier::Chips`], as a filter of nextest: they show the mistakes that a port
+/// can have. The rest is the same on all chips; in [`Tier::Night`] every test of these programs runs.
 pub const OF_EACH_CHIP: &str =
     "binary(device) & test(/^(abi|device|handover|watchdog)::/) | binary(update) & test(/^main_job::/)";
 
 impl Tier {
-    /// What the tests up to this tier need on the machine.
+    /// The images that the tests of this tier need.
+    pub fn images(self) -> impl Iterator<Item = &'static Images> {
+        IMAGES.iter().filter(move |row| [Self::Product, self].contains(&row.tier) || self == Self::Night)
+    }
+
+    /// What the tests of this tier need on the machine.
     pub fn needs(self) -> &'static [Part] {
         use Part::{Browser, Emulator, Examples, Firmware, Gdb, Python, Qemu, C};
         match self {
-            Self::Product => &[Firmware, C, Emulator, Python],
-            Self::Ci => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples],
-            Self::All => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples, Qemu],
+            Self::Product | Self::Chips => &[Firmware, C, Emulator, Python],
+            Self::Pages => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples],
+            Self::Night => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples, Qemu],
         }
     }
 
@@ -64,8 +70,9 @@ impl Tier {
     pub fn filter(self) -> &'static str {
         match self {
             Self::Product => "group(@global)",
-            Self::Ci => "group(#ci*)",
-            Self::All => "group(#night*)",
+            Self::Chips => "group(chips)",
+            Self::Pages => "group(#pages*)",
+            Self::Night => "group(#night*)",
         }
     }
 }
@@ -80,7 +87,10 @@ mod tests {
         let (config, page) = (text(".config/nextest.toml"), text("docs/testing.md"));
         let groups = config.lines().filter_map(|line| line.split_once(" = { max-threads"));
         for (group, _) in groups.clone() {
-            assert!(["ci", "night"].contains(&group.split('-').next().unwrap()), "no tier runs {group}");
+            assert!(
+                ["chips", "pages", "night"].contains(&group.split('-').next().unwrap()),
+                "no tier runs {group}"
+            );
             assert!(page.contains(&format!("`{group}`")), "docs/testing.md: {group}");
         }
         assert!(groups.count() > 2);
