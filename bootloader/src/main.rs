@@ -121,6 +121,7 @@ mod app {
 
     impl Choices for Chosen {
         const EXTRAS: Extras = EXTRAS;
+        const INTEL_HEX: bool = PRODUCT.intel_hex;
         const BLOCK_DOWNLOAD: bool = PRODUCT.block_download;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
         const LSS: bool = PRODUCT.lss;

@@ -11,7 +11,6 @@ use shared_abi::geometry::{Region, Sector};
 use shared_abi::services::{OperationResult, Services, Step, StoreState, ERASE, OFFSET};
 
 use crate::flash_controller::FlashController;
-use product::PRODUCT;
 
 /// The resident part's services.
 fn services() -> &'static Services {
@@ -114,11 +113,6 @@ impl Store {
 }
 
 impl Parameters for Store {
-    const RESUMES: bool = PRODUCT.resume;
-    const RENEWS: bool = PRODUCT.renewal;
-    const DATES: bool = PRODUCT.program_date;
-    const INTEL_HEX: bool = PRODUCT.intel_hex;
-
     fn services(&self) -> u32 {
         services().version
     }

@@ -13,6 +13,7 @@ type Rule = (&'static str, &'static str);
 
 /// The rooms of `boot-core`. A new room needs a row.
 const BOOT_CORE: &[Rule] = &[
+    ("choices", ""),
     ("crc", ""),
     ("flash", "crc"),
     ("sequence", "flash"),
@@ -28,19 +29,19 @@ const BOOT_CORE: &[Rule] = &[
     ("policy", "crc keys queue refusal resume session"),
     ("session", ""),
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
-    ("intake", "keys policy program queue refusal resume session"),
+    ("intake", "choices keys policy program queue refusal resume session"),
     // It works from the queue to the flash: no session, no object.
     ("unseal", "flash keys policy program queue renewal store"),
     ("source", "flash program queue store unseal"),
     // It works on pieces and addresses: no format, no object.
-    ("programmer", "crc flash policy program queue renewal resume sequence source store"),
+    ("programmer", "choices crc flash policy program queue renewal resume sequence source store"),
     (
         "control",
-        "flash intake keys policy program programmer refusal renewal resume session source store unseal",
+        "choices flash intake keys policy program programmer refusal renewal resume session source store unseal",
     ),
     ("stored_version", "flash programmer"),
-    ("bootloader", "control decision flash resume store stored_version"),
-    ("profile", "bootloader policy"),
+    ("bootloader", "choices control decision flash resume store stored_version"),
+    ("profile", "choices policy"),
 ];
 
 /// The rooms of `coflash-core`. A new room needs a row. `update` uses `coboot_can` for several devices at

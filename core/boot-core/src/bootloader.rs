@@ -1,7 +1,5 @@
 //! The bootloader as a CANopen device: its object dictionary and the download.
 
-use core::marker::PhantomData;
-use core::ops::RangeInclusive;
 use core::task::Poll;
 
 use canopen::bit_rate::BitRate;
@@ -12,12 +10,11 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, ClockSource, FlashError, Numbers, ProgramControl, ProgramStart, Supply, DATE_ENTRIES,
-    DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_DATE,
-    PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER,
-    ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES,
-    STATE_OPTION_BYTES, STATE_PROGRAM_START, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK,
-    UNLOCK_ENTRIES,
+    control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DATE_ENTRIES, DEVICE_STATE,
+    ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_DATE, PROGRAM_ID,
+    PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES,
+    ROM_LOADER_SIGNATURE, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES,
+    STATE_PROGRAM_START, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -30,62 +27,12 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 use {canopen::program::ACCESS, seal::access::right};
 
+use crate::choices::Has;
+pub use crate::choices::{Choices, Everything, Extras, PasswordObject};
 use crate::control::{Downloader, Policy, Sealed, Step};
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
-
-/// The objects that a dialect adds to the object dictionary.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Extras {
-    /// The object for the password that unlocks 1F50h.
-    pub password: PasswordObject,
-    /// Whether 1F50h can be read.
-    pub read_back: bool,
-    /// Whether 2002h and 2003h exist, which belong to devices with sealed images.
-    pub sealed: bool,
-    /// Whether 1201h exists, the second SDO server.
-    pub second_server: bool,
-    /// Whether 2006h exists, which says where a download goes on.
-    pub resume: bool,
-    /// Whether 1F52h exists, date and time of the program.
-    pub program_date: bool,
-    /// The program number of the bootloader itself, if it can be renewed.
-    pub bootloader: Option<u8>,
-    /// Whether 2008h exists, which starts the loader in the ROM of the chip.
-    pub rom_loader: bool,
-}
-
-impl Extras {
-    /// The objects of the standard dialect.
-    pub const STANDARD: Self = Self {
-        password: PasswordObject::None,
-        read_back: false,
-        sealed: false,
-        second_server: true,
-        resume: true,
-        program_date: true,
-        bootloader: None,
-        rom_loader: false,
-    };
-
-    /// Whether an object takes a password.
-    const fn has_password(self) -> bool {
-        !matches!(self.password, PasswordObject::None)
-    }
-}
-
-/// The object for a password.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PasswordObject {
-    /// The device has no password.
-    None,
-    /// 7F50h of a program, 32 bits: the password makes the program invalid and unlocks its 1F50h
-    /// (ESAcademy).
-    EnableFlash,
-    /// 6005h/1, a text: the password unlocks 1F50h of all programs (lifts; CiA 814-1 clause 6.3).
-    Unlock,
-}
 
 /// The [`entry_count`] objects of a device with `programs` programs (1 to 254) and the objects of a
 /// dialect (SYS TEC manual L-1112d_10, table 1).
@@ -147,42 +94,6 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
 
-/// What a bootloader has: for what it has not, it has no code.
-pub trait Choices {
-    /// The objects of its dictionary.
-    const EXTRAS: Extras = Extras {
-        password: PasswordObject::Unlock,
-        read_back: true,
-        sealed: true,
-        second_server: true,
-        resume: true,
-        program_date: true,
-        bootloader: None,
-        rom_loader: true,
-    };
-    /// Whether objects can be written by SDO block download.
-    const BLOCK_DOWNLOAD: bool = true;
-    /// Whether objects can be read by SDO block upload.
-    const BLOCK_UPLOAD: bool = true;
-    /// Whether it has layer setting services.
-    const LSS: bool = true;
-    /// Whether a master finds it by ranges of its address (identify remote slave), too.
-    const LSS_IDENTIFY: bool = true;
-    /// Whether layer setting services may store node-ID and bit rate.
-    const LSS_STORE: bool = true;
-    /// The node-IDs that the device takes: with another one no program starts.
-    const NODE_IDS: RangeInclusive<u8> = 1..=127;
-    /// Whether it may detect the bit rate of its bus by listening.
-    const DETECTS_BIT_RATE: bool = true;
-    /// 2007h/10.
-    const PROGRAM_START: ProgramStart = ProgramStart::NONE;
-}
-
-/// A bootloader with everything.
-pub struct Everything;
-
-impl Choices for Everything {}
-
 /// So long after the start, or after the last work on the flash, the device is idle, in ms: a master that has
 /// something to do has begun with it.
 const IDLE_MS: u32 = 1000;
@@ -223,7 +134,7 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Cho
     /// The active node-ID.
     id: Option<NodeId>,
     flash: F,
-    download: Downloader<'b, P, PROGRAMS>,
+    download: Downloader<'b, P, PROGRAMS, C>,
     emcy: Emcy,
     second_server: SecondServer,
     /// The password.
@@ -237,7 +148,6 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Cho
     /// From this time on the device is idle, unless there is work on the flash before it.
     idle_at: Instant,
     stored_version: StoredVersion,
-    choices: PhantomData<fn() -> C>,
 }
 
 impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<'b, F, P, PROGRAMS, C> {
@@ -282,7 +192,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
             is_asked: false,
             idle_at: Instant::from_millis(IDLE_MS),
             stored_version: StoredVersion::new(),
-            choices: PhantomData,
         };
         if report.reason == Reason::CrashLoop as u8 || report.reason == Reason::Fault as u8 {
             bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [report.reason, 0, 0, 0, 0]);
@@ -317,7 +226,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         } else if self.download.compact(self.now.has_reached(self.idle_at)) {
             return Step::Again;
         }
-        if C::EXTRAS.read_back && step == Step::Idle && self.config.download.read_back {
+        if C::READS_BACK && step == Step::Idle && self.config.download.read_back {
             return self.stored_version.step(&self.flash, self.download.installed(1));
         }
         step
@@ -326,14 +235,14 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// Sets the current time; call this at least every few milliseconds.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
-        if P::RENEWS {
+        if C::RENEWS {
             self.download.watch_trial(now);
         }
     }
 
     /// The program of a sub-index: the bootloader has a number of its own.
     fn program(sub: u8) -> u8 {
-        if P::RENEWS && C::EXTRAS.bootloader == Some(sub) {
+        if C::EXTRAS.bootloader == Some(sub) {
             BOOTLOADER
         } else {
             sub
@@ -343,7 +252,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
         // No other success ends the wait: anybody may send a command that succeeds.
-        if C::EXTRAS.sealed && self.download.rights_mut().take_authentic() {
+        if C::SEALED && self.download.rights_mut().take_authentic() {
             self.signatures.succeed();
         }
         match self.download.take_outcome() {
@@ -351,7 +260,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 // To check a signature takes the device a tenth of a second.
-                if C::EXTRAS.sealed && self.download.rights().is_present() && error == FlashError::Signature {
+                if C::SEALED && self.download.rights().is_present() && error == FlashError::Signature {
                     self.signatures.fail(self.now);
                 }
                 let code = match error {
@@ -360,7 +269,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
                     _ => emcy::code::DATA_SET,
                 };
                 let program = match C::EXTRAS.bootloader {
-                    Some(number) if P::RENEWS && program == BOOTLOADER => number,
+                    Some(number) if program == BOOTLOADER => number,
                     _ => program,
                 };
                 self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);
@@ -404,10 +313,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {
         // A reset would end the wait after a wrong password, and so speed up guessing.
-        if C::EXTRAS.has_password() && self.lock.is_waiting(self.now) {
+        if C::PASSWORD && self.lock.is_waiting(self.now) {
             return true;
         }
-        if C::EXTRAS.sealed && self.download.rights().is_present() && self.signatures.remembers(self.now) {
+        if C::SEALED && self.download.rights().is_present() && self.signatures.remembers(self.now) {
             return true;
         }
         self.download.is_finishing()
@@ -435,7 +344,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     for Bootloader<'_, F, P, PROGRAMS, C>
 {
     fn has_second_server() -> bool {
-        C::EXTRAS.second_server
+        C::SECOND_SERVER
     }
 
     fn has_block_download() -> bool {
@@ -454,7 +363,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
         }
-        if C::EXTRAS.read_back && at == Address::new(SOFTWARE_VERSION, 0) {
+        if C::READS_BACK && at == Address::new(SOFTWARE_VERSION, 0) {
             if let Some(version) = self.stored_version.text() {
                 return put(buf, version);
             }
@@ -466,17 +375,17 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(program) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(program)),
-            PROGRAM_PARTIAL if P::RESUMES => return put(buf, &self.download.partial(at.sub)),
+            PROGRAM_PARTIAL if C::RESUMES => return put(buf, &self.download.partial(at.sub)),
             DEVICE_STATE if at.sub == STATE_PROGRAM_START => const { C::PROGRAM_START.to_word() },
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
-            DEVICE_STATE if P::RENEWS && at.sub == STATE_VERSIONS => {
+            DEVICE_STATE if C::RENEWS && at.sub == STATE_VERSIONS => {
                 return put(buf, &self.download.versions());
             }
-            DEVICE_STATE if P::RENEWS && at.sub == STATE_RENEWAL => {
+            DEVICE_STATE if C::RENEWS && at.sub == STATE_RENEWAL => {
                 u32::from_le_bytes(self.download.renewal().bytes())
             }
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
-            PROGRAM_DATE if P::DATES => {
+            PROGRAM_DATE if C::DATES => {
                 let [date, time] = days_and_milliseconds(self.download.date());
                 if at.sub == 1 {
                     date
@@ -485,7 +394,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
                 }
             }
             PROGRAM_ID => self.download.identification(program),
-            SECOND_SERVER if C::EXTRAS.second_server => self.second_server.read(at.sub),
+            SECOND_SERVER if C::SECOND_SERVER => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(program).to_word(),
             PROGRAM_VERSION => self.download.version(program),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -499,17 +408,17 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             return written;
         }
         match (at.index, data) {
-            (ACCESS, request) if C::EXTRAS.sealed => {
+            (ACCESS, request) if C::SEALED => {
                 self.is_asked = true;
                 if self.signatures.is_waiting(self.now) {
                     return Err(AbortCode::DEVICE_STATE);
                 }
                 self.download.ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) if C::EXTRAS.second_server => {
+            (SECOND_SERVER, &[a, b, c, d]) if C::SECOND_SERVER => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
-            (ROM_LOADER, &[a, b, c, d]) if C::EXTRAS.rom_loader => {
+            (ROM_LOADER, &[a, b, c, d]) if C::ROM_LOADER => {
                 // A wrong signature: as of 1010h and 1011h (CiA 301 clause 7.5.2.13).
                 if u32::from_le_bytes([a, b, c, d]) != ROM_LOADER_SIGNATURE {
                     return Err(AbortCode::STORE);
@@ -521,7 +430,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
                 self.is_asked = true;
                 self.download.command(Self::program(at.sub), ProgramControl::try_from(value)?)
             }
-            (ENABLE_FLASH | UNLOCK, password) if C::EXTRAS.has_password() => {
+            (ENABLE_FLASH | UNLOCK, password) if C::PASSWORD => {
                 self.is_asked = true;
                 self.lock.open(password, self.now)?;
                 match at.index {
@@ -535,8 +444,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
         self.is_asked = true;
-        if C::EXTRAS.sealed && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now)
-        {
+        if C::SEALED && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }
         self.download.download_start(&self.flash, Self::program(at.sub), size)
@@ -561,14 +469,14 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
-        if !C::EXTRAS.read_back {
+        if !C::READS_BACK {
             return Err(AbortCode::WRITE_ONLY);
         }
         self.download.stored(Self::program(at.sub)).map(|stored| Some(stored.size))
     }
 
     fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
-        if !C::EXTRAS.read_back {
+        if !C::READS_BACK {
             return Err(AbortCode::WRITE_ONLY);
         }
         let stored = self.download.stored(Self::program(at.sub))?;
@@ -579,7 +487,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn second_server(&self) -> Channel {
-        if C::EXTRAS.second_server {
+        if C::SECOND_SERVER {
             self.second_server.channel()
         } else {
             Channel::NONE

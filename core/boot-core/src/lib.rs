@@ -19,6 +19,7 @@
 //! | [`program`] | the proof that a program may be started | |
 //! | [`renewal`] | which RAM image of the bootloader is loaded, and whether one is good | |
 //! | `keys` | whether the device takes sealed images, and whether it has keys and takes no others | |
+//! | `choices` | what a bootloader has; for the rest it has no code | |
 //! | [`crc`] | the CRCs of block file, program and journal | |
 //! | [`policy`], [`profile`] | what a product may choose, and the rules for data that follow from it | |
 //! | [`flash`] | the seam to the flash | |
@@ -26,6 +27,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bootloader;
+mod choices;
 pub mod control;
 pub mod crc;
 pub mod decision;

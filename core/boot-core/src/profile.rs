@@ -10,7 +10,7 @@ use canopen::program::{
 use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::LIFT_PASSWORD;
 
-use crate::bootloader::{Extras, PasswordObject};
+use crate::choices::{Extras, PasswordObject};
 use crate::policy::Policy;
 
 /// A dialect.

@@ -2,8 +2,8 @@
 
 use boot_core::bootloader::{Bootloader, Choices, Config};
 use boot_core::control::{Sealed, SealedMemory};
-use boot_core::flash::{Flash, FlashFault, Next};
-use boot_core::store::{Journal, Key, NodeParameters, Parameters, StoreError, Value};
+use boot_core::flash::Flash;
+use boot_core::store::{Journal, NodeParameters, Parameters};
 use shared_abi::boot_report::{BootReport, Reason};
 
 /// What a bootloader starts from, apart from its memory.
@@ -51,31 +51,6 @@ impl Boot {
     ) -> Bootloader<'b, F, P, PROGRAMS, C> {
         let Self { config, node, serial_number, report } = self;
         Bootloader::new(config, serial_number, node, &report, parameters, flash, buffer, sealed)
-    }
-}
-
-/// The journal of a product with these choices: whether its bootloader can be renewed, and whether a download
-/// goes on after a cut.
-pub struct Store<const RENEWS: bool, const RESUMES: bool>(pub Journal);
-
-impl<const RENEWS: bool, const RESUMES: bool> Parameters for Store<RENEWS, RESUMES> {
-    const RENEWS: bool = RENEWS;
-    const RESUMES: bool = RESUMES;
-
-    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        self.0.get(flash, key)
-    }
-
-    fn store(&mut self, key: Key, value: Value) {
-        self.0.store(key, value);
-    }
-
-    fn compact(&mut self, used: u32) -> bool {
-        self.0.compact(used)
-    }
-
-    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
-        self.0.next(flash, outcome)
     }
 }
 

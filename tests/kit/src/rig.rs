@@ -24,7 +24,7 @@ use shared_abi::ram_image::Host;
 use shared_abi::renewal::word;
 use shared_abi::warm_start::BootRequest;
 
-use crate::boot::{leaked, Boot, Store};
+use crate::boot::{leaked, Boot};
 use crate::ihex::{record, END_OF_FILE};
 use crate::model::{Chip, ModelFlash, ONE_PROGRAM, TWO_PROGRAMS};
 use crate::renewal::{self, loads};
@@ -335,13 +335,12 @@ impl Rig {
             let (_, origin, trial_end) = loaded.expect("a bootloader can be loaded");
             boot.report = BootReport { renewal: word(origin, trial_end), ..boot.report };
         }
-        let renewed = Store::<true, true>(Journal::open(&flash, setup.layout.parameters));
         match (setup.programs(), number) {
             (1, None) => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, buffer, sealed)),
             (2, None) => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, buffer, sealed)),
-            (1, Some(2)) => Box::new(boot.with::<_, _, 2, Renews<2>>(renewed, flash, buffer, sealed)),
-            (1, Some(3)) => Box::new(boot.with::<_, _, 2, Renews<3>>(renewed, flash, buffer, sealed)),
-            (2, Some(3)) => Box::new(boot.with::<_, _, 3, Renews<3>>(renewed, flash, buffer, sealed)),
+            (1, Some(2)) => Box::new(boot.with::<_, _, 2, Renews<2>>(parameters, flash, buffer, sealed)),
+            (1, Some(3)) => Box::new(boot.with::<_, _, 2, Renews<3>>(parameters, flash, buffer, sealed)),
+            (2, Some(3)) => Box::new(boot.with::<_, _, 3, Renews<3>>(parameters, flash, buffer, sealed)),
             _ => unreachable!(),
         }
     }

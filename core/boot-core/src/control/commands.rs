@@ -8,13 +8,14 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use super::{find, Downloader, Failure};
+use crate::choices::{Choices, Has};
 use crate::flash::Flash;
 use crate::policy::Erase;
 use crate::refusal::Refusal;
 use crate::session::Session;
 use crate::store::{Parameters, ProgramRecord};
 
-impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAMS, C> {
     /// 1F51h: a command. It is checked and acknowledged now, and [`step`](Self::step) carries it
     /// out.
     ///
@@ -23,11 +24,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        if P::RENEWS && program == BOOTLOADER {
+        if C::RENEWS && program == BOOTLOADER {
             return self.command_bootloader(command);
         }
         let keeps = command == Clear && self.programmer.may_take(program).is_err();
-        let state = find::<P>(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        let state = find::<C>(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
             // No program runs, but the bootloader: the requested state already exists. Many masters send
             // no CLEAR after STOP.
@@ -155,7 +156,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(crate) fn unlock_all(&mut self) -> Result<(), AbortCode> {
         let last = PROGRAMS as u8;
         (1..=last).try_for_each(|place| {
-            self.unlock(if P::RENEWS && place == last { BOOTLOADER } else { place }, false)
+            self.unlock(if C::RENEWS && place == last { BOOTLOADER } else { place }, false)
         })
     }
 
@@ -168,16 +169,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
-        let is_program = !(P::RENEWS && program == BOOTLOADER);
+        let is_program = !(C::RENEWS && program == BOOTLOADER);
         let at_once = at_once && is_program && self.rights.permits(right::ERASE);
         let keeps = at_once && self.programmer.may_take(program).is_err();
-        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         if self.boot_request.is_some() || !self.programmer.is_abortable() || keeps {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         self.download_cancel();
         self.programmer.abort();
-        if let Some(state) = find::<P>(&mut self.programs, program) {
+        if let Some(state) = find::<C>(&mut self.programs, program) {
             state.locked = false;
             state.failure = None;
             state.streamed = false;

@@ -29,6 +29,7 @@ use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
+use crate::choices::{Choices, Everything, Has};
 use crate::flash::Flash;
 use crate::intake::Intake;
 use crate::keys::Images;
@@ -108,12 +109,12 @@ struct Transfer {
 /// The download of programs into flash. `PROGRAMS` is the number of programs in the layout, and one
 /// more if the bootloader can be renewed: its own image is the last one, with the number
 /// [`BOOTLOADER`].
-pub struct Downloader<'b, P, const PROGRAMS: usize> {
+pub struct Downloader<'b, P, const PROGRAMS: usize, C = Everything> {
     layout: &'static Layout,
     policy: &'static Policy,
     parameters: P,
     programs: [Program; PROGRAMS],
-    programmer: Programmer<'b, P>,
+    programmer: Programmer<'b, C>,
     rights: Rights<'b>,
     transfer: Option<Transfer>,
     /// The abort for a client that continues to send after the flash has failed.
@@ -128,7 +129,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     renewal: Option<Known>,
 }
 
-impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
+impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PROGRAMS, C> {
     /// Starts with the stored parameters. The larger the `buffer`, the further the flash may lag
     /// behind the bus; blocks larger than the buffer, or than 16 KiB, are refused.
     pub fn new<F: Flash>(
@@ -144,10 +145,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let (record, partial) = if P::RENEWS && layout.program(number).is_none() {
+            let (record, partial) = if C::RENEWS && layout.program(number).is_none() {
                 (None, Partial::NONE)
             } else {
-                load(&parameters, flash, number, &rights)
+                load::<C>(&parameters, flash, number, &rights)
             };
             let region = layout.program(number).unwrap_or(Region::new(0, 0));
             Program {
@@ -159,7 +160,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 partial,
                 version: 0,
                 told_date: 0,
-                date: date(&parameters, flash, number, region, record),
+                date: date::<C>(&parameters, flash, number, region, record),
                 streamed: false,
                 start_when_verified: false,
                 locked: policy.locked,
@@ -185,14 +186,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Takes the report of the resident part. If it has refused to start a program, its status is that of a
     /// START of no valid program. A damaged program is none any more.
     pub(crate) fn take_report<F: Flash>(&mut self, flash: &F, report: &BootReport) {
-        if P::RENEWS {
+        if C::RENEWS {
             self.begin_renewal(flash, report);
         }
         // A program may have answered STOP itself before it has left; it then leaves no node-ID.
-        if let (Some(state), 0) = (find::<P>(&mut self.programs, report.owed.program), report.owed.value) {
+        if let (Some(state), 0) = (find::<C>(&mut self.programs, report.owed.program), report.owed.value) {
             state.stopped = true;
         }
-        let Some(state) = find::<P>(&mut self.programs, report.refused) else { return };
+        let Some(state) = find::<C>(&mut self.programs, report.refused) else { return };
         state.failure = Some(Failure::of(FlashError::NoValidProgram));
         if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {
             state.record = None;
@@ -231,7 +232,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 1F51h: no program runs. The value shows whether a program exists.
     #[must_use]
     pub fn control(&self, program: u8) -> ProgramState {
-        if P::RENEWS && program == BOOTLOADER {
+        if C::RENEWS && program == BOOTLOADER {
             return ProgramState::Running;
         }
         match self.program(program).and_then(|state| state.record) {
@@ -252,7 +253,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let Some(state) = self.program(program) else { return 0 };
         match state.record {
             Some(record) => record.version,
-            None if P::RENEWS && program == BOOTLOADER => state.version,
+            None if C::RENEWS && program == BOOTLOADER => state.version,
             None => 0,
         }
     }
@@ -378,7 +379,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         match event {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
-            Some(Event::Stored { program: BOOTLOADER, ends }) if P::RENEWS => {
+            Some(Event::Stored { program: BOOTLOADER, ends }) if C::RENEWS => {
                 self.image_stored(flash);
                 if ends {
                     self.end(BOOTLOADER, Ok(()));
@@ -386,8 +387,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     self.drop_partial(flash);
                 }
             }
-            Some(Event::Written { program: BOOTLOADER, expected, crc }) if P::RENEWS => {
-                if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+            Some(Event::Written { program: BOOTLOADER, expected, crc }) if C::RENEWS => {
+                if let Some(state) = find::<C>(&mut self.programs, BOOTLOADER) {
                     state.session = Session::Idle;
                 }
                 let record = self.check_image(flash, &expected, crc);
@@ -398,13 +399,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
             }
             Some(Event::Stored { program, ends }) => {
-                let (record, partial) = load(&self.parameters, flash, program, &self.rights);
-                if P::RENEWS {
+                let (record, partial) = load::<C>(&self.parameters, flash, program, &self.rights);
+                if C::RENEWS {
                     self.note_record(program, record);
                 }
-                if let Some(state) = find::<P>(&mut self.programs, program) {
+                if let Some(state) = find::<C>(&mut self.programs, program) {
                     state.record = record;
-                    state.date = date(&self.parameters, flash, program, state.region, record);
+                    state.date = date::<C>(&self.parameters, flash, program, state.region, record);
                     if record.is_none() {
                         state.identification = 0;
                     }
@@ -421,7 +422,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
             }
             Some(Event::Written { program, expected, crc }) => {
-                if let Some(state) = find::<P>(&mut self.programs, program) {
+                if let Some(state) = find::<C>(&mut self.programs, program) {
                     state.identification = crc;
                     state.session = Session::Idle;
                 }
@@ -460,7 +461,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     }
                     _ => AbortCode::HARDWARE,
                 };
-                if P::RENEWS {
+                if C::RENEWS {
                     // A record that could not be removed stays.
                     self.image_stored(flash);
                 }
@@ -521,14 +522,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Ends a piece of work on a program.
     fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
         // Without a target the received data were discarded, also those of another program.
-        let is_gone = P::RENEWS && self.programmer.program().is_none();
+        let is_gone = C::RENEWS && self.programmer.program().is_none();
         let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program || is_gone);
         if outcome.is_err() && current {
             self.transfer = None;
             self.programmer.source_mut().queue.clear();
         }
         self.outcome = Some((program, outcome));
-        let Some(state) = find::<P>(&mut self.programs, program) else { return };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
         state.failure = outcome.err().map(|error| Failure { error, detail: self.programmer.take_detail() });
         if outcome.is_err() {
@@ -550,49 +551,49 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// The program with this number, if it exists.
     fn program(&self, program: u8) -> Option<&Program> {
-        self.programs.get(place::<P>(PROGRAMS, program))
+        self.programs.get(place::<C>(PROGRAMS, program))
     }
 }
 
 /// The record of a program, if the device may start it; and its download that was cut off. Both are of
 /// one reading: after a power cut the next one may differ.
-fn load<F: Flash, P: Parameters>(
-    parameters: &P,
-    flash: &F,
+fn load<C: Choices>(
+    parameters: &impl Parameters,
+    flash: &impl Flash,
     number: u8,
     rights: &Rights<'_>,
 ) -> (Option<ProgramRecord>, Partial) {
     let value = parameters.get(flash, Key::program(number)).unwrap_or([0; 4]);
     let record = ProgramRecord::from_value(value);
     let record = record.filter(|record| record.is_sealed() || !rights.takes_no_other());
-    (record, if P::RESUMES { ProgramRecord::partial_of(value) } else { Partial::NONE })
+    (record, if C::RESUMES { ProgramRecord::partial_of(value) } else { Partial::NONE })
 }
 
 /// The creation date of a program with this record, in seconds since 1970-01-01 UTC; 0 if unknown.
-fn date<F: Flash, P: Parameters>(
-    parameters: &P,
-    flash: &F,
+fn date<C: Choices>(
+    parameters: &impl Parameters,
+    flash: &impl Flash,
     number: u8,
     region: Region,
     record: Option<ProgramRecord>,
 ) -> u32 {
     match record {
-        Some(record) if P::DATES => record.date(parameters, flash, number, region),
+        Some(record) if C::DATES => record.date(parameters, flash, number, region),
         _ => 0,
     }
 }
 
 /// The program with this number, if it exists.
-fn find<P: Parameters>(programs: &mut [Program], number: u8) -> Option<&mut Program> {
-    programs.get_mut(place::<P>(programs.len(), number))
+fn find<C: Choices>(programs: &mut [Program], number: u8) -> Option<&mut Program> {
+    programs.get_mut(place::<C>(programs.len(), number))
 }
 
 /// The place of a program in the list of all. The last one is the bootloader's, if it can be renewed.
-fn place<P: Parameters>(count: usize, number: u8) -> usize {
+fn place<C: Choices>(count: usize, number: u8) -> usize {
     let of_bootloader = count.wrapping_sub(1);
     match usize::from(number).wrapping_sub(1) {
-        _ if P::RENEWS && number == BOOTLOADER => of_bootloader,
-        place if P::RENEWS && place == of_bootloader => usize::MAX,
+        _ if C::RENEWS && number == BOOTLOADER => of_bootloader,
+        place if C::RENEWS && place == of_bootloader => usize::MAX,
         place => place,
     }
 }

@@ -10,6 +10,7 @@ use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
 use super::{find, load, Downloader, Failure, Program};
+use crate::choices::{Choices, Has};
 use crate::flash::Flash;
 use crate::policy::Renewal;
 use crate::program::Expected;
@@ -23,7 +24,7 @@ use crate::store::{Parameters, ProgramRecord, RenewalRecord};
 /// Of a device without renewal.
 const NO_HOST: Host = Renewal::NONE.host(0, 0);
 
-impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAMS, C> {
     fn known(&self) -> Known {
         self.renewal.unwrap_or(Known::NOTHING)
     }
@@ -67,7 +68,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let identification = identification(flash, running, &header);
         self.renewal =
             Some(Known { origin, trial_end, version: header.version, identification, confirmed: false });
-        if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+        if let Some(state) = find::<C>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
         }
         self.show_image(identification, header.version);
@@ -75,7 +76,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let layout = self.layout;
         self.programmer.renewing = Some(Renewing { layout, policy, host, record: None, is_occupied: false });
         let last = layout.programs.len() as u8;
-        self.note_record(last, load(&self.parameters, flash, last, &self.rights).0);
+        self.note_record(last, load::<C>(&self.parameters, flash, last, &self.rights).0);
         let record = self.image_record(flash);
         self.set_record(record);
         let Some(record) = record else { return };
@@ -130,7 +131,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let busy = self.boot_request.is_some() || self.programmer.has_work();
         let is_open = |program: &Program| matches!(program.session, Session::Open { .. });
         let loads = self.transfer.is_some() || self.programs.iter().any(is_open);
-        let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else {
+        let Some(state) = find::<C>(&mut self.programs, BOOTLOADER) else {
             return Err(AbortCode::NO_SUB_INDEX);
         };
         if matches!(command, Stop | StartBootloader) {
@@ -190,7 +191,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// The image in 1F56h/n and 2005h/n: the one that was staged in this run, otherwise the running one.
     fn show_image(&mut self, identification: u32, version: u32) {
-        let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else { return };
+        let Some(state) = find::<C>(&mut self.programs, BOOTLOADER) else { return };
         (state.identification, state.version) = (identification, version);
     }
 
@@ -229,7 +230,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         let Err(error) = may else { return Ok(()) };
         let detail = self.programmer.take_detail();
-        let Some(state) = find::<P>(&mut self.programs, program) else { return Ok(()) };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return Ok(()) };
         let abort = state.refuse(Refusal::untimely(error));
         state.failure = Some(Failure { error, detail });
         Err(abort)
@@ -246,7 +247,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// The flash for a new image of the bootloader; `None` for any other program.
     pub(super) fn staging_of(&self, program: u8) -> Option<Region> {
-        let places = if P::RENEWS && program == BOOTLOADER { Places::of(self.layout) } else { None };
+        let places = if C::RENEWS && program == BOOTLOADER { Places::of(self.layout) } else { None };
         places.map(|places| places.staging)
     }
 
@@ -263,8 +264,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn drop_partial<F: Flash>(&mut self, flash: &F) {
         let Some(Places { staging, .. }) = Places::of(self.layout) else { return };
         let last = self.layout.programs.len() as u8;
-        let (_, stored) = load(&self.parameters, flash, last, &self.rights);
-        let Some(state) = find::<P>(&mut self.programs, last) else { return };
+        let (_, stored) = load::<C>(&self.parameters, flash, last, &self.rights);
+        let Some(state) = find::<C>(&mut self.programs, last) else { return };
         if matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
         }

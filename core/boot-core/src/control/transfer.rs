@@ -7,8 +7,9 @@ use shared_abi::block_file::FRAMING;
 use shared_abi::ram_image::Host;
 
 use super::{find, Downloader, Failure, Transfer};
+use crate::choices::{Choices, Has};
 use crate::flash::Flash;
-use crate::intake::{Destination, Findings, Intake, Takes};
+use crate::intake::{Destination, Findings, Intake};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
@@ -16,11 +17,7 @@ use crate::session::{LastBlock, Session, ANY};
 use crate::store::Parameters;
 use crate::unseal::Place;
 
-impl<P: Parameters> Takes for P {
-    const INTEL_HEX: bool = P::INTEL_HEX;
-}
-
-impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAMS, C> {
     /// 1F50h: the client starts a transfer, with its size if it is known.
     ///
     /// # Errors
@@ -32,11 +29,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         size: Option<u32>,
     ) -> Result<(), AbortCode> {
         self.download_cancel();
-        if P::RENEWS {
+        if C::RENEWS {
             self.may_renew(flash, program)?;
         }
         let room = self.has_room();
-        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         // A second CLEAR erases everything, but not after a download, taken or refused: then it may come
         // from a host that repeats the same wrong file.
         if let Session::Cleared { just } = &mut state.session {
@@ -93,7 +90,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn download_end(&mut self) -> Result<(), AbortCode> {
         let program = self.take(None)?;
         self.transfer = None;
-        if let Some(state) = find::<P>(&mut self.programs, program) {
+        if let Some(state) = find::<C>(&mut self.programs, program) {
             state.failure = None;
         }
         Ok(())
@@ -104,7 +101,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn download_cancel(&mut self) {
         let Some(Transfer { program, intake }) = self.transfer.take() else { return };
         self.programmer.source_mut().queue.discard();
-        let Some(state) = find::<P>(&mut self.programs, program) else { return };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return };
         if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
             state.failure.get_or_insert(Failure::of(FlashError::Format));
@@ -117,7 +114,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
         let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
         let program = *program;
-        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(self.fault) };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return Err(self.fault) };
         let judge = Judge {
             layout: self.layout,
             policy: self.policy,
@@ -135,7 +132,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             findings: Findings::default(),
         };
         let outcome = match data {
-            Some(bytes) => intake.data::<P>(bytes, &mut to),
+            Some(bytes) => intake.data::<C>(bytes, &mut to),
             None => intake.end(&mut to),
         };
         let findings = to.findings;
@@ -168,29 +165,29 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let staging = self.staging_of(program);
-        let has = P::RENEWS.then(|| {
+        let has = C::RENEWS.then(|| {
             let Host { board, services, features, .. } = self.host();
             Requirements { board, services, features: features.0 }
         });
-        let Some(state) = find::<P>(&mut self.programs, program) else { return };
+        let Some(state) = find::<C>(&mut self.programs, program) else { return };
         if let Some(begin) = findings.begins {
             // A RAM image has its version in its header.
             if staging.is_none() {
                 (state.version, state.told_date) = (begin.version, begin.date);
             }
             let mut next = 1;
-            let goes_on = P::RESUMES && state.resumable().is_same(begin.partial);
+            let goes_on = C::RESUMES && state.resumable().is_same(begin.partial);
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
                     next = ANY;
                 }
-                if P::RESUMES && !goes_on {
+                if C::RESUMES && !goes_on {
                     state.partial = Partial::NONE;
                     self.programmer.disown(program);
                 }
             } else {
-                let mut partial = if P::RESUMES { begin.partial } else { begin.partial.disowned() };
+                let mut partial = if C::RESUMES { begin.partial } else { begin.partial.disowned() };
                 if goes_on && matches!(state.session, Session::Idle) && findings.sealed.is_none() {
                     partial = state.partial;
                     next = ANY;

@@ -1,5 +1,6 @@
 //! What each format implements, and what it gets and reports.
 
+use crate::choices::Choices;
 use crate::keys::Linked;
 use crate::policy::Judge;
 use crate::queue::Queue;
@@ -19,12 +20,6 @@ pub(crate) enum Recognition<T> {
     Yes(T),
 }
 
-/// Which formats a device takes, besides those that each one takes.
-pub(crate) trait Takes {
-    /// Intel HEX. Without it, the compiler leaves out the code.
-    const INTEL_HEX: bool;
-}
-
 /// A format of programs.
 pub(crate) trait Format: Sized {
     /// Whether it carries a whole program in one transfer. Such a client is slowed down if the
@@ -32,7 +27,7 @@ pub(crate) trait Format: Sized {
     const IS_STREAM: bool;
 
     /// Whether the device takes the format. Without it, the compiler leaves out the code.
-    fn is_taken<T: Takes>() -> bool {
+    fn is_taken<C: Choices>() -> bool {
         true
     }
 

@@ -7,8 +7,9 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
-use super::format::{Destination, Format, Recognition, Takes};
+use super::format::{Destination, Format, Recognition};
 use super::stream::Stream;
+use crate::choices::Choices;
 use crate::policy::Judge;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
@@ -22,8 +23,8 @@ pub(super) struct IntelHex {
 impl Format for IntelHex {
     const IS_STREAM: bool = true;
 
-    fn is_taken<T: Takes>() -> bool {
-        T::INTEL_HEX
+    fn is_taken<C: Choices>() -> bool {
+        C::INTEL_HEX
     }
 
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {

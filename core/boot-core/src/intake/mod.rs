@@ -21,10 +21,11 @@ mod stream;
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
+use crate::choices::Choices;
 use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-pub(crate) use format::{Destination, Findings, Format, Recognition, Takes};
+pub(crate) use format::{Destination, Findings, Format, Recognition};
 
 formats! {
     Sealed(sealed::SealedImage),
@@ -58,7 +59,7 @@ impl Intake {
     }
 
     /// Takes the next bytes.
-    pub(crate) fn data<T: Takes>(
+    pub(crate) fn data<C: Choices>(
         &mut self,
         mut bytes: &[u8],
         to: &mut Destination<'_, '_>,
@@ -69,18 +70,18 @@ impl Intake {
             *len += more;
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
-            let Some(mut known) = Known::recognise::<T>(&first[..len], &to.judge)? else { return Ok(()) };
+            let Some(mut known) = Known::recognise::<C>(&first[..len], &to.judge)? else { return Ok(()) };
             if to.judge.images.only_sealed().is_some()
                 && !matches!(known, Known::Sealed(_) | Known::BlockFile(_))
             {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;
-            known.data::<T>(&first[..len], to)?;
+            known.data::<C>(&first[..len], to)?;
             self.state = State::Known(known);
         }
         match &mut self.state {
-            State::Known(known) if !bytes.is_empty() => known.data::<T>(bytes, to),
+            State::Known(known) if !bytes.is_empty() => known.data::<C>(bytes, to),
             _ => Ok(()),
         }
     }
@@ -127,10 +128,10 @@ macro_rules! formats {
 
         impl Known {
             /// `None` if there are too few bytes to decide.
-            fn recognise<T: Takes>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
+            fn recognise<C: Choices>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
                 let mut more = false;
                 $(match <$format>::recognise(first, judge) {
-                    Recognition::Yes(format) if <$format>::is_taken::<T>() => return Ok(Some(Self::$name(format))),
+                    Recognition::Yes(format) if <$format>::is_taken::<C>() => return Ok(Some(Self::$name(format))),
                     Recognition::More => more = true,
                     Recognition::Yes(_) | Recognition::No => {}
                 })*
@@ -154,13 +155,13 @@ macro_rules! formats {
                 }
             }
 
-            fn data<T: Takes>(
+            fn data<C: Choices>(
                 &mut self,
                 bytes: &[u8],
                 to: &mut Destination<'_, '_>,
             ) -> Result<(), Refusal> {
                 match self {
-                    $(Self::$name(format) if <$format>::is_taken::<T>() => format.data(bytes, to),)*
+                    $(Self::$name(format) if <$format>::is_taken::<C>() => format.data(bytes, to),)*
                     _ => Err(to.judge.unknown_format()),
                 }
             }

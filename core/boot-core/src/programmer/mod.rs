@@ -25,6 +25,7 @@ use shared_abi::geometry::{Region, Sector};
 use shared_abi::ram_image::Header;
 use shared_abi::renewal::{State, BOOTLOADER};
 
+use crate::choices::{Choices, Has};
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
@@ -130,10 +131,10 @@ enum Change {
     Compact,
 }
 
-/// The flash half. It starts operations and polls them, but never waits for them. `P` is the store of the
-/// device, which says what it can do.
-pub(crate) struct Programmer<'b, P> {
-    store: PhantomData<fn() -> P>,
+/// The flash half. It starts operations and polls them, but never waits for them. `C` is what
+/// the device has.
+pub(crate) struct Programmer<'b, C> {
+    choices: PhantomData<fn() -> C>,
     source: Source<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
@@ -157,11 +158,11 @@ pub(crate) struct Programmer<'b, P> {
     running: Option<Step>,
 }
 
-impl<'b, P: Parameters> Programmer<'b, P> {
+impl<'b, C: Choices> Programmer<'b, C> {
     /// One step of a CRC covers `crc_step` bytes.
     pub(crate) fn new(source: Source<'b>, crc_kind: CrcKind, crc_step: u32) -> Self {
         Self {
-            store: PhantomData,
+            choices: PhantomData,
             source,
             crc_kind,
             crc_step,
@@ -231,7 +232,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     pub(crate) fn disown(&mut self, program: u8) {
         let Some(target) = self.target.as_mut().filter(|target| target.program == program) else { return };
         // The first piece removes the record in any case.
-        if P::RESUMES && target.partial.disown() && target.untouched.is_none() {
+        if C::RESUMES && target.partial.disown() && target.untouched.is_none() {
             self.void(program);
         }
     }
@@ -319,7 +320,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// [`FlashError::Busy`] for a confirmed image; [`FlashError::NotCleared`], with the program as the
     /// [detail](Self::take_detail).
     pub(crate) fn may_take(&mut self, program: u8) -> Result<(), FlashError> {
-        let Some(renewing) = self.renewing.as_ref().filter(|_| P::RENEWS) else { return Ok(()) };
+        let Some(renewing) = self.renewing.as_ref().filter(|_| C::RENEWS) else { return Ok(()) };
         let last = renewing.last_program();
         if program != BOOTLOADER && program != last {
             return Ok(());
@@ -337,7 +338,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// Whether the record of a program may be replaced or removed now. That of a confirmed image is changed by its
     /// installation alone, which does not ask; each other [`store`] of a record that may be the image's does.
     fn may_replace(&self, program: u8) -> Result<(), FlashError> {
-        let is_kept = P::RENEWS
+        let is_kept = C::RENEWS
             && program == BOOTLOADER
             && !self.is_installing()
             && self.renewing.as_ref().is_some_and(Renewing::is_confirmed);
@@ -351,12 +352,12 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Whether a RAM image is being installed.
     pub(crate) fn is_installing(&self) -> bool {
-        P::RENEWS && self.install.is_some()
+        C::RENEWS && self.install.is_some()
     }
 
     /// The installation has failed.
     fn stop_installing(&mut self) {
-        if P::RENEWS {
+        if C::RENEWS {
             self.install = None;
         }
     }
@@ -413,7 +414,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Compacts the store, if at least `used` of its places are used. Returns whether it begins.
-    pub(crate) fn compact(&mut self, parameters: &mut P, used: u32) -> bool {
+    pub(crate) fn compact(&mut self, parameters: &mut impl Parameters, used: u32) -> bool {
         if self.job.is_some() || !self.may_compact || !parameters.compact(used) {
             return false;
         }
@@ -481,7 +482,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// waits for it, once; it is stored before anything else is done.
     pub(crate) fn step<F: Flash>(
         &mut self,
-        parameters: &mut P,
+        parameters: &mut impl Parameters,
         flash: &mut F,
         note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> (Step, Option<Event>) {
@@ -546,7 +547,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                     false => Next::Again,
                 };
             }
-            (Some(Job::Install), _) if P::RENEWS => {
+            (Some(Job::Install), _) if C::RENEWS => {
                 let places = self.places();
                 let record = self.image();
                 let step = self.crc_step;
@@ -571,7 +572,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 let at = match (&self.job, &self.install) {
                     (Some(Job::Erase { until, .. }), _) => until - 1,
                     (Some(Job::Write(write)), _) => write.at(),
-                    (Some(Job::Install), Some(install)) if P::RENEWS => install.at(),
+                    (Some(Job::Install), Some(install)) if C::RENEWS => install.at(),
                     _ => 0,
                 };
                 self.detail = flash.sector_at(at).map_or(0, |sector| sector.number);
@@ -596,7 +597,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         }
         match (job, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
-            (Job::Store(Change::Permit, _), Ok(())) if P::RENEWS => {
+            (Job::Store(Change::Permit, _), Ok(())) if C::RENEWS => {
                 let places = self.places();
                 self.install = Some(Phase::erase(places));
                 Some(Event::Stored { program: BOOTLOADER, ends: false })
@@ -642,7 +643,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 None
             }
             (Job::Write(_), Ok(())) => {
-                if P::RESUMES {
+                if C::RESUMES {
                     self.note();
                 }
                 self.source.written();
@@ -675,14 +676,14 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// Chooses the next work for an idle flash: the first of these that there is.
     fn choose<F: Flash>(
         &mut self,
-        parameters: &mut P,
+        parameters: &mut impl Parameters,
         flash: &F,
         note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> Result<Option<Job>, FlashError> {
         if let Some(job) = note().map(|note| store_note(parameters, note)).or_else(|| self.process_first()) {
             return Ok(Some(job));
         }
-        if P::RENEWS {
+        if C::RENEWS {
             while self.install.is_some() {
                 if let Some(job) = self.go_on_installing(parameters, flash)? {
                     return Ok(Some(job));
@@ -693,7 +694,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         if self.unwritten.is_none() {
             self.give_up_old(flash, piece)?;
         }
-        if P::RENEWS {
+        if C::RENEWS {
             self.give_up_staging(piece);
         }
         if let Some(region) = self.unwritten.take() {
@@ -710,7 +711,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             return Ok(Some(job));
         }
         match piece {
-            Some(piece) => target.write::<F, P>(flash, piece).map(Some),
+            Some(piece) => target.write::<C>(flash, piece).map(Some),
             None => self.complete_program(parameters),
         }
     }
@@ -720,7 +721,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     fn piece(&self) -> Option<Piece> {
         let piece = self.source.piece()?;
         match &self.renewing {
-            Some(renewing) if P::RENEWS && self.program() == Some(BOOTLOADER) => {
+            Some(renewing) if C::RENEWS && self.program() == Some(BOOTLOADER) => {
                 Some(renewing.placed(piece, self.source.unsealer.is_active()))
             }
             _ => Some(piece),
@@ -740,7 +741,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             return Ok(());
         }
         let Some(ahead) = target.untouched else { return Ok(()) };
-        if P::RENEWS {
+        if C::RENEWS {
             // Nothing was lost: the download ends.
             let program = target.program;
             self.may_take(program)?;
@@ -758,7 +759,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         };
         target.untouched = None;
         target.ahead = target.ahead.max(ahead);
-        if P::RESUMES && target.partial.is_resumed() {
+        if C::RESUMES && target.partial.is_resumed() {
             // The data end within a sector that was erased for them; or at the start of one that
             // may be half erased.
             let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
@@ -856,11 +857,15 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.
-    fn remove_record<F: Flash>(&mut self, parameters: &mut P, flash: &F) -> Result<Option<Job>, FlashError> {
+    fn remove_record(
+        &mut self,
+        parameters: &mut impl Parameters,
+        flash: &impl Flash,
+    ) -> Result<Option<Job>, FlashError> {
         if self.voids == 0 {
             return Ok(None);
         }
-        let program = of_bit::<P>(self.voids.trailing_zeros() as u8);
+        let program = of_bit::<C>(self.voids.trailing_zeros() as u8);
         // A record that stays is not asked for again.
         self.may_replace(program).inspect_err(|_| self.voids = 0)?;
         // The counter that a program has proved must survive its record.
@@ -884,7 +889,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     fn complete_program(&mut self, parameters: &mut impl Parameters) -> Result<Option<Job>, FlashError> {
         let Some(target) = &mut self.target else { return Ok(None) };
         let program = target.program;
-        if P::DATES && program != BOOTLOADER {
+        if C::DATES && program != BOOTLOADER {
             if let Some(date) = self.source.take_date() {
                 parameters.store(Key::date(program), date);
                 return Ok(Some(Job::Store(Change::Value, program)));
@@ -936,8 +941,8 @@ impl Target {
     }
 
     /// Writes the piece.
-    fn write<F: Flash, P: Parameters>(&self, flash: &F, piece: Piece) -> Result<Job, FlashError> {
-        let again = P::RESUMES && self.partial.is_resumed();
+    fn write<C: Choices>(&self, flash: &impl Flash, piece: Piece) -> Result<Job, FlashError> {
+        let again = C::RESUMES && self.partial.is_resumed();
         WritePiece::new(flash, piece, again).map(Job::Write).ok_or(FlashError::NotCleared)
     }
 }
@@ -962,9 +967,9 @@ fn judge_image(
 }
 
 /// The program of a bit in `voids`: [`bit`] has 31 for the bootloader.
-fn of_bit<P: Parameters>(bit: u8) -> u8 {
+fn of_bit<C: Choices>(bit: u8) -> u8 {
     match bit {
-        31 if P::RENEWS => BOOTLOADER,
+        31 if C::RENEWS => BOOTLOADER,
         bit => bit,
     }
 }

@@ -73,17 +73,6 @@ pub enum StoreError {
 /// already writes nothing. Callers rely on the last one: they store whenever a value must be
 /// certain, also if it reads so already.
 pub trait Parameters {
-    /// Whether the progress of a download is stored, so that one that was cut off goes on where it
-    /// stopped (2006h). Without it, the compiler leaves out the code.
-    const RESUMES: bool = true;
-    /// Whether the bootloader can be renewed (docs/renewal.md): then it is one more program of the
-    /// [`Downloader`](crate::control::Downloader). Without it, the compiler leaves out the code.
-    const RENEWS: bool = false;
-    /// Whether the dates of programs are kept (1F52h). Without it, the compiler leaves out the code.
-    const DATES: bool = true;
-    /// Whether programs are taken in Intel HEX. Without it, the compiler leaves out the code.
-    const INTEL_HEX: bool = true;
-
     /// The version of the services of the resident part, which owns the store. The flash must be idle.
     fn services(&self) -> u32 {
         SERVICES_VERSION

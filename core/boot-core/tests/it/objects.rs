@@ -565,13 +565,16 @@ fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_
     assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
 }
 
-/// A product that does without them has no second server, and a request for a block transfer is unknown.
+/// A product that does without them has no second server, no progress and no date of a program; it takes no
+/// Intel HEX, and a request for a block transfer is unknown.
 #[test]
 fn what_a_product_does_without_is_not_there() {
     use canopen::sdo::server::{Config as ServerConfig, SdoServer};
     struct Least;
     impl Choices for Least {
-        const EXTRAS: Extras = Extras { second_server: false, resume: false, ..Extras::STANDARD };
+        const EXTRAS: Extras =
+            Extras { second_server: false, resume: false, program_date: false, ..Extras::STANDARD };
+        const INTEL_HEX: bool = false;
         const BLOCK_DOWNLOAD: bool = false;
         const BLOCK_UPLOAD: bool = false;
     }
@@ -580,7 +583,13 @@ fn what_a_product_does_without_is_not_there() {
     let channel = least.second_server();
     assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
     assert_eq!(least.second_server(), channel);
-    assert!(least.read(Address::new(0x1201, 1), &mut [0; 4]).is_err());
+    // The dictionary of this configuration has these objects, and nothing stands behind them.
+    for (index, sub) in [(0x1201, 1), (0x2006, 1), (0x1F52, 1), (0x1F52, 2)] {
+        assert!(least.read(Address::new(index, sub), &mut [0; 8]).is_err(), "{index:04X}h/{sub}");
+    }
+    let program = Address::new(0x1F50, 1);
+    assert_eq!(least.download_start(program, None), Ok(()));
+    assert!(least.download_data(program, b":10000000").is_err(), "Intel HEX");
     // Nor does it take a password, or give a program back.
     for index in [0x7F50, 0x6005, 0x2002] {
         assert!(least.write(Address::new(index, 1), &[0; 4]).is_err(), "{index:04X}h");

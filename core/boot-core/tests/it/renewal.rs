@@ -43,9 +43,6 @@ impl Choices for Renews {
     const EXTRAS: Extras = EXTRAS;
 }
 
-/// The journal of a device with renewal.
-type Store = kit::boot::Store<true, true>;
-
 const BUSY: u32 = 0x86;
 const NOT_CLEARED: u32 = 0x08;
 const FORMAT: u32 = 0x04;
@@ -121,7 +118,7 @@ impl Board {
         let (_, origin, trial_end) = self.loads();
         self.request = None;
         let report = BootReport { renewal: word(origin, trial_end), ..BootReport::NONE };
-        let journal = kit::boot::Store(Journal::open(&self.flash, LAYOUT.parameters));
+        let journal = Journal::open(&self.flash, LAYOUT.parameters);
         let (buffer, sealed) = leaked(512);
         let boot = Boot { report, ..Boot::new(&CONFIG, node()) };
         Node(boot.with(journal, &mut self.flash, buffer, sealed))
@@ -176,7 +173,7 @@ fn program_of(size: usize) -> Vec<u8> {
 }
 
 /// A running bootloader.
-struct Node<'f>(Bootloader<'static, &'f mut ModelFlash, Store, 2, Renews>);
+struct Node<'f>(Bootloader<'static, &'f mut ModelFlash, Journal, 2, Renews>);
 
 impl Node<'_> {
     fn settle(&mut self) {

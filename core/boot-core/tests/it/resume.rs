@@ -1,6 +1,6 @@
 //! A download of block files that was cut off goes on where it stopped, and a block may come twice.
 
-use boot_core::bootloader::{Bootloader, Config};
+use boot_core::bootloader::{Bootloader, Choices, Config, Everything, Extras};
 use boot_core::control::Step;
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
@@ -8,7 +8,7 @@ use boot_core::store::Journal;
 use canopen::od::{Address, Objects};
 use canopen::AbortCode;
 use kit::bench::{self, block, block_file, last, program, Bench, CLEAR, CONFIG, DATA, LAYOUT, PROGRAM};
-use kit::boot::{leaked, Boot, Store};
+use kit::boot::{leaked, Boot};
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use kit::rig::{self, Rig, LIFT_1, LIFT_2, PAULUS_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
@@ -140,11 +140,15 @@ fn a_host_that_comes_back_goes_on_with_the_next_block() {
 /// Whoever comes after it, as a bootloader with resumption, finds no download to go on with.
 #[test]
 fn a_product_without_resumption_leaves_no_begun_download() {
+    struct Without;
+    impl Choices for Without {
+        const EXTRAS: Extras = Extras { resume: false, ..Everything::EXTRAS };
+    }
     let file = named(&program(0xC00, 0x33));
     let mut flash = ModelFlash::new(&CHIP);
-    let journal = Store::<false, false>(Journal::open(&flash, LAYOUT.parameters));
+    let journal = Journal::open(&flash, LAYOUT.parameters);
     let (buffer, sealed) = leaked(256);
-    let mut node: Bootloader<'_, _, _, 1> =
+    let mut node: Bootloader<'_, _, _, 1, Without> =
         Boot::new(&CONFIG, bench::node()).with(journal, &mut flash, buffer, sealed);
     for block in &file[..20] {
         node.download_start(DATA, Some(block.len() as u32)).unwrap();
