@@ -3,22 +3,10 @@
 
 use canopen::device;
 use canopen::emcy;
-use canopen::od::{Access, DataType, Entry, Table};
+use canopen::od::Table;
 use canopen::program::{control_count, Numbers, APPLICATION_STATE_ENTRIES, DATE_ENTRIES};
 use coboot_app::layout::Layout;
 use coboot_app::renewal;
-
-/// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
-pub const REENTRY_PATH: u16 = 0x2000;
-/// The bootloader's state of this program: bit 0 installed, bit 1 signed. A write with bit 1 set
-/// confirms the program; a write without it removes the signature.
-pub const CONFIRMATION: u16 = 0x2001;
-
-/// Objects that demonstrate the other services of coboot. A product replaces them.
-const SHOW_ENTRIES: [Entry; 2] = [
-    Entry::var(REENTRY_PATH, "Re-entry path into the bootloader", DataType::Unsigned8, Access::Rw).default(0),
-    Entry::var(CONFIRMATION, "Confirmation", DataType::Unsigned8, Access::Rw),
-];
 
 /// The sub-indices of program control on a device with this memory map: its programs, and the bootloader
 /// itself where the map has room for a new one (docs/renewal.md).
@@ -32,7 +20,6 @@ pub const fn numbers(layout: &Layout) -> Numbers {
 pub const fn entry_count(numbers: Numbers) -> usize {
     device::ENTRIES.len()
         + emcy::ENTRIES.len()
-        + SHOW_ENTRIES.len()
         + control_count(numbers)
         + APPLICATION_STATE_ENTRIES.len()
         + DATE_ENTRIES.len()
@@ -44,7 +31,6 @@ pub const fn entries<const LEN: usize>(numbers: Numbers) -> Table<LEN> {
     Table::EMPTY
         .with(&device::ENTRIES)
         .with(&emcy::ENTRIES)
-        .with(&SHOW_ENTRIES)
         .with_program_control(numbers)
         .with(&APPLICATION_STATE_ENTRIES)
         .with(&DATE_ENTRIES)

@@ -3,6 +3,8 @@
 //! On the host the crate has the table alone.
 #![no_std]
 
+#[cfg(target_arch = "arm")]
+pub mod bus;
 pub mod entries;
 #[cfg(target_arch = "arm")]
 pub mod objects;

@@ -5,6 +5,7 @@
 //! | `main.rs` | wiring of the tasks: put your own beside them |
 //! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
 //! | `objects.rs` | the values of the object dictionary, `may_leave`, and the callback `start_bootloader` |
+//! | `bus.rs` | nothing: it carries out what the slave asks of the CAN controller |
 //! | `Cargo.toml` | the version of the application |
 //!
 //! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's; 2 is free.
@@ -46,14 +47,13 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use app_template::objects::{Application, HEARTBEAT_MS};
+    use app_template::bus::carry_out;
+    use app_template::objects::Application;
     use bsp::clock::Source;
-    use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
-    use canopen::node::{self, NmtPolicy};
-    use canopen::sdo::server::Config as SdoConfig;
-    use canopen::slave::{self, Slave};
-    use canopen::{BitRate, Frame, Instant, NodeId};
-    use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
+    use bsp::{line, pac, CanPort, LAYOUT};
+    use canopen::slave::Slave;
+    use canopen::{Frame, Instant};
+    use coboot_app::{Bootloader, Next, ReentryPath};
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use rtic_monotonics::fugit::ExtU32;
@@ -65,13 +65,6 @@ mod app {
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// The bit rate that the program uses when no bootloader has started it.
-    const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
-        Some(rate) => rate,
-        None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
-    };
-    /// How the device is to leave: from the protocol task to `idle`, where no exception is active.
-    static EXIT: Exit = Exit::new();
 
     #[shared]
     struct Shared {
@@ -96,52 +89,15 @@ mod app {
         let can = CanPort::new(board.can, Source::Crystal);
         Mono::start(bsp::cleared_systick(cx.core.SYST), bsp::SYSCLK);
 
-        // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
-        // with the application.
-        let start = Start::read(
-            LAYOUT,
-            Defaults {
-                node_id: NodeId::new(NODE_ID).map(NodeId::get),
-                bit_rate: BIT_RATE,
-                serial_number: bsp::serial_number(),
-            },
-        );
-        let node_id = start.node_id.and_then(NodeId::new);
-        let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
-        let application = Application::new(&start, bit_rate, VERSION);
-        let config = slave::Config {
-            node: node::Config {
-                heartbeat_ms: HEARTBEAT_MS,
-                nmt: NmtPolicy::Follow,
-                sdo: SdoConfig {
-                    request_base: start.sdo().request,
-                    response_base: start.sdo().response,
-                    ..SdoConfig::DEFAULT
-                },
-                ..node::Config::default()
-            },
-            ..slave::Config::default()
-        };
+        let (application, slave) = Application::start(VERSION);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
-        (
-            Shared { can },
-            Local {
-                received,
-                to_handle,
-                slave: Slave::new(application.lss_address(), node_id, bit_rate, config),
-                application,
-                led: board.led,
-            },
-        )
+        (Shared { can }, Local { received, to_handle, slave, application, led: board.led })
     }
 
     #[idle]
     fn idle(_: idle::Context) -> ! {
         loop {
-            if let Some((path, request)) = EXIT.asked() {
-                Bootloader::new(LAYOUT).leave(path, request);
-            }
             cortex_m::asm::wfi();
         }
     }
@@ -160,22 +116,15 @@ mod app {
         let protocol::SharedResources { mut can, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, application, .. } = cx.local;
         application.set_time(now);
-        if !serves(slave, &mut can, application) {
-            return;
-        }
         let status = can.lock(line::status);
         slave.observe(status, now, application);
-        loop {
+        while serves(slave, &mut can, application) {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
             // that wait after it.
             carry_out(slave, &mut can, now, application);
             let Some(frame) = to_handle.dequeue() else { return };
             if slave.handle(&frame, now, application) {
                 application.control.nmt_reset(now.as_millis());
-            }
-            application.leave_owed(slave);
-            if !serves(slave, &mut can, application) {
-                return;
             }
         }
     }
@@ -184,22 +133,9 @@ mod app {
     fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, application: &mut Application) -> bool {
         let bus_idle = slave.is_idle() && can.lock(CanPort::is_idle);
         match application.proceed(bus_idle) {
-            Next::Serve => return true,
-            Next::Wait => {}
-            Next::Leave(request) => EXIT.ask(application.path(request), request),
-        }
-        false
-    }
-
-    /// Carries out the slave's actions until there are none left.
-    fn carry_out(
-        slave: &mut Slave,
-        can: &mut impl Mutex<T = CanPort>,
-        now: Instant,
-        application: &mut Application,
-    ) {
-        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), application) {
-            can.lock(|can| line::carry_out(can, output));
+            Next::Serve => true,
+            Next::Wait => false,
+            Next::Leave(request) => Bootloader::new(LAYOUT).leave(ReentryPath::SystemReset, request),
         }
     }
 

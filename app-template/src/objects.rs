@@ -4,32 +4,34 @@
 use core::sync::atomic::{AtomicU8, Ordering::SeqCst};
 use core::task::Poll;
 
-use bsp::{line, IDENTITY, LAYOUT};
+use bsp::{line, IDENTITY, LAYOUT, NODE_ID};
 use canopen::device::Device;
 use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
-use canopen::lss::{LssAddress, LssDevice, StoreError};
-use canopen::od::{put, Address, Entry, Objects};
-use canopen::program::{
-    region_value, Numbers, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID,
-    PROGRAM_REGION, PROGRAM_VERSION,
-};
-use canopen::slave::Slave;
-use canopen::slave::SlaveDevice;
+use canopen::lss::{LssDevice, StoreError};
+use canopen::node::{self, NmtPolicy};
+use canopen::od::{put, Address, Entry, Objects, Reply};
+use canopen::program::{Numbers, PROGRAM_CONTROL};
+use canopen::sdo::server::Config as SdoConfig;
+use canopen::slave::{self, Slave, SlaveDevice};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use coboot_app::callgate::PROGRAM_SIGNED;
 use coboot_app::nameplate::Nameplate;
 use coboot_app::rules::Command;
-use coboot_app::warm_start::{BootRequest, Owed};
-use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services, Start};
+use coboot_app::warm_start::BootRequest;
+use coboot_app::{Bootloader, Defaults, Next, ProgramControl, Start};
 
-use crate::entries::{entries, entry_count, numbers, CONFIRMATION, REENTRY_PATH};
+use crate::entries::{entries, entry_count, numbers};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h shows a host that the
 /// application runs.
 const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.
 pub const HEARTBEAT_MS: u16 = 500;
+/// The bit rate that the program uses when no bootloader has started it.
+const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(bsp::BIT_RATE) {
+    Some(rate) => rate,
+    None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
+};
 /// 1018h/1 to 3, from the board file.
 const BOARD: Nameplate = Nameplate::new(IDENTITY.vendor_id, IDENTITY.product_code, IDENTITY.revision, 0);
 /// 80h to 1F51h: a master calls the bootloader (SYS TEC manual L-1112d_10, table 2).
@@ -68,10 +70,6 @@ pub struct Application {
     /// 1F51h, 1F56h, 1F57h, and the way back.
     pub control: ProgramControl,
     bootloader: Bootloader,
-    /// The re-entry path (2000h).
-    path: ReentryPath,
-    /// An answer that the SDO server still has to withhold.
-    owed: Option<Owed>,
     /// The time of the last call of [`Self::set_time`].
     now: Instant,
     emcy: Emcy,
@@ -82,9 +80,35 @@ pub struct Application {
 }
 
 impl Application {
-    /// Builds the state from the bootloader's values. Asks the bootloader for the CRC over this
-    /// program, once. `software_version` is 100Ah.
-    pub fn new(start: &Start, bit_rate: BitRate, software_version: &'static str) -> Self {
+    /// The application, and its slave, with what the bootloader has left: node-ID, bit rate and the
+    /// COB-IDs of SDO, so that a client of the bootloader goes on with the application. Asks the
+    /// bootloader for the CRC over this program, once. `software_version` is 100Ah.
+    pub fn start(software_version: &'static str) -> (Self, Slave) {
+        let defaults = Defaults {
+            node_id: NodeId::new(NODE_ID).map(NodeId::get),
+            bit_rate: bsp::BIT_RATE,
+            serial_number: bsp::serial_number(),
+        };
+        let start = Start::read(LAYOUT, defaults);
+        let application = Self::new(&start, software_version);
+        let sdo = SdoConfig {
+            request_base: start.sdo().request,
+            response_base: start.sdo().response,
+            ..SdoConfig::DEFAULT
+        };
+        let node = node::Config {
+            heartbeat_ms: HEARTBEAT_MS,
+            nmt: NmtPolicy::Follow,
+            sdo,
+            ..node::Config::default()
+        };
+        let config = slave::Config { node, ..slave::Config::default() };
+        let address = application.device.lss_address();
+        let slave = Slave::new(address, application.id, application.bit_rate, config);
+        (application, slave)
+    }
+
+    fn new(start: &Start, software_version: &'static str) -> Self {
         // A bootloader that has another identity from the nameplate of the device shows that one.
         let Nameplate { vendor_id, product_code, revision, .. } = start.nameplate().unwrap_or(BOARD);
         let device = Device {
@@ -99,23 +123,16 @@ impl Application {
             serial_number: start.serial_number,
         };
         let crc = BOOTLOADER.program_crc(start.program);
-        let control = ProgramControl::new(start, NUMBERS.programs, crc).asking(may_leave);
+        let control = ProgramControl::new(start, LAYOUT, crc).asking(may_leave);
         Self {
             device,
             control,
             bootloader: BOOTLOADER,
-            path: ReentryPath::default(),
-            owed: None,
             now: Instant::from_millis(0),
-            bit_rate,
+            bit_rate: BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE),
             emcy: Emcy::new(),
             id: start.node_id.and_then(NodeId::new),
         }
-    }
-
-    /// The identity of the device for layer setting services.
-    pub fn lss_address(&self) -> LssAddress {
-        self.device.lss_address()
     }
 
     /// Passes the time in: call it at least every few milliseconds.
@@ -128,19 +145,8 @@ impl Application {
         if self.control.leaving() {
             // An NMT reset did not ask.
             MACHINE.store(LEAVES, SeqCst);
-        } else {
-            // A command may be refused for another reason after the yes.
-            let _ = MACHINE.compare_exchange(LEAVES, STANDS, SeqCst, SeqCst);
         }
         self.control.proceed(bus_idle, self.now.as_millis())
-    }
-
-    /// The path on which the device leaves with this request: an NMT master gets a reset.
-    pub fn path(&self, request: BootRequest) -> ReentryPath {
-        match request {
-            BootRequest::PowerOn | BootRequest::Rescue => ReentryPath::SystemReset,
-            _ => self.path,
-        }
     }
 
     /// The callback of 1F51h = 80h, START_BOOTLOADER: a master calls the bootloader in the place of
@@ -150,22 +156,14 @@ impl Application {
     /// lets the device leave when the answer is on the bus. The first 80h to a program that has just
     /// been downloaded and started confirms that program instead (`coboot_app::rules`). Whether the
     /// device may leave at all is asked of [`may_leave`], for this command and every other one.
-    fn start_bootloader(&mut self, program: u8) -> Result<(), AbortCode> {
-        let now = self.now.as_millis();
-        Ok(self.control.write_answered(program, &[START_BOOTLOADER], now, &mut self.bootloader)?)
+    fn start_bootloader(&mut self, program: u8, expedited: bool) -> Result<Reply, AbortCode> {
+        self.command(program, &[START_BOOTLOADER], expedited)
     }
 
-    /// Call it after every frame. Withdraws an answer that the bootloader is to send. If the client
-    /// has written in segments, the answer cannot be withdrawn, so the command is judged once more.
-    pub fn leave_owed(&mut self, slave: &mut Slave) {
-        let Some(owed) = self.owed.take() else { return };
+    /// Every command: STOP and CLEAR are the bootloader's to carry out and to confirm.
+    fn command(&mut self, program: u8, value: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
         let now = self.now.as_millis();
-        let Owed { program, value, .. } = owed;
-        if slave.withdraw_answer(&[0x60, 0x51, 0x1F, program, 0, 0, 0, 0]) {
-            self.control.leave_owed(owed, now);
-        } else if let Err(abort) = self.control.write_answered(program, &[value], now, &mut self.bootloader) {
-            slave.refuse(abort.into());
-        }
+        Ok(self.control.write(program, value, expedited, now, &mut self.bootloader)?.into())
     }
 }
 
@@ -181,61 +179,20 @@ impl Objects for Application {
         if let Some(read) = self.device.read(at, buf) {
             return read;
         }
-        let Self { control, bootloader, .. } = self;
-        match at.index {
-            PROGRAM_CONTROL => put(buf, &[control.state(at.sub, bootloader)?]),
-            PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
-            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
-            PROGRAM_DATE => {
-                let [date, time] = control.software_date();
-                put(buf, &if at.sub == 1 { date } else { time }.to_le_bytes())
-            }
-            PROGRAM_REGION => {
-                let region = control.region(at.sub, LAYOUT).ok_or(AbortCode::NO_DATA)?;
-                put(buf, &region_value(region.base, region.size))
-            }
-            PROGRAM_VERSION => {
-                let version = control.info(at.sub, bootloader).map_or(0, |info| info.version);
-                put(buf, &version.to_le_bytes())
-            }
-            DEVICE_STATE => put(buf, &[control.bootloader()]),
-            REENTRY_PATH => put(buf, &[self.path as u8]),
-            CONFIRMATION => {
-                let info = bootloader.program_info(control.program()).map_err(|_| AbortCode::DEVICE_STATE)?;
-                put(buf, &[info.flags as u8])
-            }
-            _ => Err(AbortCode::NO_DATA),
+        match self.control.read(at.index, at.sub, &mut self.bootloader) {
+            Some(value) => put(buf, &value?),
+            None => Err(AbortCode::NO_DATA),
         }
     }
 
-    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
-        if let Some(written) = self.emcy.write(at, data) {
-            return written;
-        }
-        let now = self.now.as_millis();
+    fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
         match (at.index, data) {
-            (PROGRAM_CONTROL, &[START_BOOTLOADER]) => self.start_bootloader(at.sub),
-            // The other commands: stop, start, reset and clear a program.
-            (PROGRAM_CONTROL, data) => {
-                match self.control.write(at.sub, data, now, &mut self.bootloader)? {
-                    Answer::Send => {}
-                    Answer::Withhold(owed) => self.owed = Some(owed),
-                }
-                Ok(())
+            (PROGRAM_CONTROL, &[START_BOOTLOADER]) => self.start_bootloader(at.sub, expedited),
+            (PROGRAM_CONTROL, value) => self.command(at.sub, value, expedited),
+            _ => {
+                let written = self.emcy.write(at, data).unwrap_or(Err(AbortCode::UNSUPPORTED_ACCESS));
+                written.map(|()| Reply::Send)
             }
-            (REENTRY_PATH, &[value]) => {
-                self.path = ReentryPath::from_number(value).ok_or(AbortCode::INVALID_VALUE)?;
-                Ok(())
-            }
-            (CONFIRMATION, &[value @ 0..=3]) => {
-                if u32::from(value) & PROGRAM_SIGNED != 0 {
-                    let confirmed = self.control.confirm(now, &mut self.bootloader);
-                    return confirmed.map_err(|_| AbortCode::DEVICE_STATE);
-                }
-                self.bootloader.invalidate(self.control.program()).map_err(|_| AbortCode::DEVICE_STATE)
-            }
-            (CONFIRMATION, _) => Err(AbortCode::INVALID_VALUE),
-            _ => Err(AbortCode::UNSUPPORTED_ACCESS),
         }
     }
 

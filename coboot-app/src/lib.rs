@@ -40,7 +40,7 @@ pub mod start;
 pub use abort::Abort;
 pub use bootloader::{Bootloader, Confirmed, Exit, ReentryPath, Services};
 pub use departure::Next;
-pub use program_control::{Answer, ProgramControl};
+pub use program_control::{ProgramControl, Reply};
 pub use start::{Defaults, Start};
 
 pub use shared_abi::bit_timing::BitTiming;

@@ -1,15 +1,12 @@
-//! Objects 1F51h, 1F56h and 1F57h of an application (CiA 302-3), for any CANopen stack.
+//! Objects 1F51h, 1F56h and 1F57h of an application (CiA 302-3), and those of coboot beside them, for
+//! any CANopen stack.
 //!
 //! [`ProgramControl`] says what to answer, and when to leave. What the stack does with it:
 //!
 //! | request | call | answer |
 //! |---|---|---|
-//! | upload of 1F51h/1F56h/1F57h, sub-index 0 | [`highest`](ProgramControl::highest) | 1 byte |
-//! | upload of 1F51h/n | [`state`](ProgramControl::state) | 1 byte |
-//! | upload of 1F56h/n | [`identification`](ProgramControl::identification) | 4 bytes, little-endian |
-//! | upload of 1F57h/n | [`flash_status`](ProgramControl::flash_status) | 4 bytes, little-endian |
-//! | upload of 2007h/1 | [`bootloader`](ProgramControl::bootloader) | 1 byte |
-//! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
+//! | upload of one of the objects below | [`read`](ProgramControl::read) | the [`Value`] |
+//! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Reply`] says |
 //! | NMT reset node | [`nmt_reset`](ProgramControl::nmt_reset) | |
 //!
 //! On a device whose bootloader can be renewed over CAN, that has a sub-index, too: here it is a program that
@@ -18,7 +15,6 @@
 //! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
 use shared_abi::callgate::{CallgateError, ProgramArgs, PROGRAM_INSTALLED, PROGRAM_SIGNED};
-use shared_abi::geometry::Region;
 use shared_abi::handoff::SdoBases;
 use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
@@ -38,7 +34,12 @@ pub const PROGRAM_ID: u16 = 0x1F56;
 pub const PROGRAM_DATE: u16 = 0x1F52;
 /// 1F57h: flash status identification.
 pub const FLASH_STATUS: u16 = 0x1F57;
-/// 2007h: device state, an object of coboot. An application has its sub-index 1 alone.
+/// 2004h: where the flash of a program is, an object of coboot: address, then size.
+pub const PROGRAM_REGION: u16 = 0x2004;
+/// 2005h: the version of a program, an object of coboot: that of its record in the bootloader.
+pub const PROGRAM_VERSION: u16 = 0x2005;
+/// 2007h: device state, an object of coboot. An application has its sub-index 1 alone: the
+/// sub-index of the bootloader itself; 0 if it cannot be renewed over CAN.
 pub const DEVICE_STATE: u16 = 0x2007;
 
 /// The value of 1F51h for a program that is installed and does not run.
@@ -48,16 +49,55 @@ const RUNNING: u8 = 1;
 /// The value of 1F51h where no program is installed.
 const ABSENT: u8 = 3;
 
-/// How a download to 1F51h is answered that was taken.
+/// What an upload reads: 1 to 8 bytes, little-endian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Value {
+    bytes: [u8; 8],
+    len: u8,
+}
+
+impl Value {
+    pub(crate) const fn byte(value: u8) -> Self {
+        Self { bytes: (value as u64).to_le_bytes(), len: 1 }
+    }
+
+    #[cfg(feature = "responder")]
+    pub(crate) const fn half(value: u16) -> Self {
+        Self { bytes: (value as u64).to_le_bytes(), len: 2 }
+    }
+
+    pub(crate) const fn word(value: u32) -> Self {
+        Self { bytes: (value as u64).to_le_bytes(), len: 4 }
+    }
+}
+
+impl core::ops::Deref for Value {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.bytes[..usize::from(self.len)]
+    }
+}
+
+/// What the SDO server does after a download to 1F51h that was taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
-pub enum Answer {
-    /// The SDO server sends its positive answer, as always.
+pub enum Reply {
+    /// It confirms the download, as always.
     Send,
-    /// The SDO server sends **no** answer, and [`ProgramControl::leave_owed`] is called with this: the
-    /// bootloader answers in this program's place. A server that cannot withhold its answer calls
-    /// [`ProgramControl::write_answered`] instead, and does what that says.
-    Withhold(Owed),
+    /// It sends **nothing**, and nor does anything else of the device from now on: the bootloader
+    /// confirms in this program's place.
+    Withhold,
+}
+
+#[cfg(feature = "canopen")]
+impl From<Reply> for canopen::od::Reply {
+    fn from(reply: Reply) -> Self {
+        match reply {
+            Reply::Send => Self::Send,
+            Reply::Withhold => Self::Withhold,
+        }
+    }
 }
 
 /// Program control of a running application.
@@ -65,8 +105,8 @@ pub enum Answer {
 pub struct ProgramControl {
     /// The program that runs.
     program: u8,
-    /// The number of programs of the device.
-    programs: u8,
+    /// The places of the programs.
+    layout: &'static Layout,
     /// The sub-index of the bootloader itself, if it can be renewed over CAN.
     bootloader: Option<u8>,
     /// 1F56h of the program that runs.
@@ -80,8 +120,6 @@ pub struct ProgramControl {
     promised: Option<BootRequest>,
     /// The rule of [`asking`](Self::asking).
     may_leave: fn() -> bool,
-    /// An answer is to be withheld: the departure begins as soon as that is done.
-    withholds: bool,
     /// The application has refused a master since its start: an NMT reset leaves with this request.
     refused: Option<BootRequest>,
     /// Node-ID in force.
@@ -95,21 +133,19 @@ pub struct ProgramControl {
 }
 
 impl ProgramControl {
-    /// Of a program that came up so, on a device with `programs` programs
-    /// (`LAYOUT.programs.len()`). `crc` is what 1F56h reads for this program
-    /// (`Bootloader::program_crc`).
+    /// Of a program that came up so, on a device with this memory map. `crc` is what 1F56h reads for
+    /// this program (`Bootloader::program_crc`).
     #[must_use]
-    pub const fn new(start: &Start, programs: u8, crc: u32) -> Self {
+    pub const fn new(start: &Start, layout: &'static Layout, crc: u32) -> Self {
         Self {
             program: start.program,
-            programs,
+            layout,
             bootloader: start.bootloader_number(),
             crc,
             fresh: start.fresh,
             armed: false,
             promised: None,
             may_leave: || true,
-            withholds: false,
             refused: None,
             node_id: start.node_id,
             bootloader_node: start.bootloader_node(),
@@ -120,8 +156,8 @@ impl ProgramControl {
     }
 
     /// For a device whose bootloader has another node-ID than this program (126 on a lift), or
-    /// whose SDO server cannot withhold an answer: the application answers STOP itself and refuses
-    /// CLEAR.
+    /// whose SDO server cannot withhold a confirmation: the application answers STOP itself and
+    /// refuses CLEAR.
     #[must_use]
     pub const fn answering_itself(self) -> Self {
         Self { bootloader_node: None, ..self }
@@ -129,7 +165,7 @@ impl ProgramControl {
 
     /// With the application's rule about leaving, which is asked once before a command of 1F51h, or
     /// a request of the application itself, ends in a reset. It answers at once. No: the command is
-    /// refused (08000022h), and nothing is owed. Yes is final: the reset follows, 500 ms later at
+    /// refused (08000022h), and the program stays. Yes is final: the reset follows, 500 ms later at
     /// most, and what stands must not start to move while [`leaving`](Self::leaving). An NMT reset
     /// does not ask.
     ///
@@ -145,7 +181,7 @@ impl ProgramControl {
     /// Whether the device is about to leave, until the reset of the chip.
     #[must_use]
     pub fn leaving(&self) -> bool {
-        self.withholds || self.departure != Departure::Staying
+        self.departure != Departure::Staying
     }
 
     /// The bases of the COB-IDs of SDO.
@@ -154,52 +190,58 @@ impl ProgramControl {
         self.sdo
     }
 
-    /// The two elements of 1F52h, see [`Start::software_date`].
-    #[must_use]
-    pub const fn software_date(&self) -> [u32; 2] {
-        self.software_date
-    }
-
     /// The program that runs, 1 to 254.
     #[must_use]
     pub const fn program(&self) -> u8 {
         self.program
     }
 
-    /// The highest sub-index that the three objects have: what sub-index 0 reads.
-    #[must_use]
-    pub const fn highest(&self) -> u8 {
-        match self.bootloader {
-            Some(number) => number,
-            None => self.programs,
+    /// What an upload reads of 1F51h, 1F52h, 1F56h, 1F57h, 2004h, 2005h and 2007h; `None` for any
+    /// other object. To an application, the bootloader is a program that does not run.
+    pub fn read(&self, index: u16, sub: u8, services: &mut impl Services) -> Option<Result<Value, Abort>> {
+        let highest = match index {
+            DEVICE_STATE => 1,
+            PROGRAM_DATE => 2,
+            PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS | PROGRAM_REGION | PROGRAM_VERSION => {
+                self.bootloader.unwrap_or(self.programs())
+            }
+            _ => return None,
+        };
+        Some(match (index, sub) {
+            (_, 0) => Ok(Value::byte(highest)),
+            (DEVICE_STATE, 1) => Ok(Value::byte(self.bootloader.unwrap_or(0))),
+            (PROGRAM_DATE, 1 | 2) => Ok(Value::word(self.software_date[usize::from(sub) - 1])),
+            (DEVICE_STATE | PROGRAM_DATE, _) => Err(Abort::NO_SUB_INDEX),
+            (_, sub) => self.check(sub).map(|()| self.of_program(index, sub, services)),
+        })
+    }
+
+    /// One of the objects that each program has.
+    fn of_program(&self, index: u16, sub: u8, services: &mut impl Services) -> Value {
+        let is_bootloader = Some(sub) == self.bootloader;
+        let mut info = || services.program_info(if is_bootloader { BOOTLOADER } else { sub });
+        match index {
+            PROGRAM_CONTROL if sub == self.program => Value::byte(RUNNING),
+            PROGRAM_CONTROL => {
+                let is_there = info().is_ok_and(|info| info.flags & PROGRAM_INSTALLED != 0);
+                Value::byte(if is_there { STOPPED } else { ABSENT })
+            }
+            PROGRAM_ID if sub == self.program => Value::word(self.crc),
+            PROGRAM_ID => Value::word(info().map_or(0, |info| info.crc)),
+            PROGRAM_REGION => {
+                let region = if is_bootloader { self.layout.home } else { self.layout.program(sub) };
+                let [base, size] = region.map_or([0; 2], |region| [region.base, region.size]);
+                Value { bytes: (u64::from(size) << 32 | u64::from(base)).to_le_bytes(), len: 8 }
+            }
+            PROGRAM_VERSION => Value::word(info().map_or(0, |info| info.version)),
+            // 1F57h: no command is being carried out, and none has failed.
+            _ => Value::word(0),
         }
     }
 
-    /// What 2007h/1 reads: the sub-index of the bootloader itself; 0 if it cannot be renewed over CAN.
-    #[must_use]
-    pub const fn bootloader(&self) -> u8 {
-        match self.bootloader {
-            Some(number) => number,
-            None => 0,
-        }
-    }
-
-    /// What the bootloader knows of the program `sub`, or of itself.
-    ///
-    /// # Errors
-    /// What the callgate has reported.
-    pub fn info(&self, sub: u8, services: &mut impl Services) -> Result<ProgramArgs, CallgateError> {
-        services.program_info(if Some(sub) == self.bootloader { BOOTLOADER } else { sub })
-    }
-
-    /// The flash of the program `sub`, or of the bootloader.
-    #[must_use]
-    pub fn region(&self, sub: u8, layout: &Layout) -> Option<Region> {
-        if Some(sub) == self.bootloader {
-            layout.home
-        } else {
-            layout.program(sub)
-        }
+    /// The number of programs of the device.
+    const fn programs(&self) -> u8 {
+        self.layout.programs.len() as u8
     }
 
     /// The device has this node-ID from now on; `None` for none.
@@ -222,43 +264,11 @@ impl ProgramControl {
         self.armed = true;
     }
 
-    /// What 1F51h/`sub` reads: 1 for the program that runs, 0 for another one that is installed, 3 for
-    /// none.
-    ///
-    /// # Errors
-    /// [`Abort::NO_SUB_INDEX`].
-    pub fn state(&self, sub: u8, services: &mut impl Services) -> Result<u8, Abort> {
-        self.check(sub)?;
-        if sub == self.program {
-            return Ok(RUNNING);
-        }
-        Ok(match self.info(sub, services) {
-            Ok(info) if info.flags & PROGRAM_INSTALLED != 0 => STOPPED,
-            _ => ABSENT,
-        })
-    }
-
-    /// What 1F56h/`sub` reads: the CRC of the program; 0 where there is none.
-    ///
-    /// # Errors
-    /// [`Abort::NO_SUB_INDEX`].
-    pub fn identification(&self, sub: u8, services: &mut impl Services) -> Result<u32, Abort> {
-        self.check(sub)?;
-        if sub == self.program {
-            return Ok(self.crc);
-        }
-        Ok(self.info(sub, services).map_or(0, |info| info.crc))
-    }
-
-    /// What 1F57h/`sub` reads: 0, no command is being carried out and none failed.
-    ///
-    /// # Errors
-    /// [`Abort::NO_SUB_INDEX`].
-    pub fn flash_status(&self, sub: u8) -> Result<u32, Abort> {
-        self.check(sub).map(|()| 0)
-    }
-
     /// Handles a download of `data` to 1F51h/`sub`. Call it before the SDO answer is sent.
+    ///
+    /// `expedited`: the client wrote it by an expedited download, whose confirmation the bootloader
+    /// can send as well. That of a segment or block is this program's alone, so it answers STOP
+    /// itself and refuses CLEAR.
     ///
     /// # Errors
     /// The code of the SDO abort to answer with; nothing was changed.
@@ -266,38 +276,10 @@ impl ProgramControl {
         &mut self,
         sub: u8,
         data: &[u8],
+        expedited: bool,
         now: u32,
         services: &mut impl Services,
-    ) -> Result<Answer, Abort> {
-        let answers = self.bootloader_node.filter(|node| self.node_id == Some(*node));
-        self.take(sub, data, now, answers, services)
-    }
-
-    /// As [`write`](Self::write), for a server that always sends its answer. Example: the client
-    /// wrote the byte in segments, and only this program can acknowledge their end.
-    ///
-    /// # Errors
-    /// As for [`write`](Self::write).
-    pub fn write_answered(
-        &mut self,
-        sub: u8,
-        data: &[u8],
-        now: u32,
-        services: &mut impl Services,
-    ) -> Result<(), Abort> {
-        self.take(sub, data, now, None, services).map(|_| ())
-    }
-
-    fn take(
-        &mut self,
-        sub: u8,
-        data: &[u8],
-        now: u32,
-        answers: Option<u8>,
-        services: &mut impl Services,
-    ) -> Result<Answer, Abort> {
-        // The command whose answer could not be withheld comes once more, and was permitted.
-        let permitted = core::mem::take(&mut self.withholds);
+    ) -> Result<Reply, Abort> {
         if sub == 0 {
             return Err(Abort::READ_ONLY);
         }
@@ -310,13 +292,14 @@ impl ProgramControl {
         let command = Command::from_value(value).ok_or(Abort::INVALID_VALUE)?;
         if command == Command::Stop && Some(sub) == self.bootloader {
             // It does not run.
-            return Ok(Answer::Send);
+            return Ok(Reply::Send);
         }
+        let answers = self.bootloader_node.filter(|node| expedited && self.node_id == Some(*node));
         let Self { fresh, armed, .. } = *self;
         let standing = Standing { fresh, armed, can_hand_over: answers.is_some() };
         let reaction = react(command, sub == self.program, standing)?;
         let leaves = matches!(reaction, Reaction::CallBack | Reaction::Restart | Reaction::HandOver);
-        if leaves && !permitted && !self.permits() {
+        if leaves && !self.permits() {
             return Err(self.refuse(services));
         }
         match reaction {
@@ -342,18 +325,11 @@ impl ProgramControl {
             Reaction::Restart => self.leave(BootRequest::Start(sub), now),
             Reaction::HandOver => {
                 let node_id = answers.unwrap_or(0);
-                self.withholds = true;
-                return Ok(Answer::Withhold(Owed { program: sub, value, node_id }));
+                self.departure.begin_silent(BootRequest::Owed(Owed { program: sub, value, node_id }), now);
+                return Ok(Reply::Withhold);
             }
         }
-        Ok(Answer::Send)
-    }
-
-    /// The answer was withheld ([`Answer::Withhold`]): from now on the device takes and sends
-    /// nothing.
-    pub fn leave_owed(&mut self, owed: Owed, now: u32) {
-        self.withholds = false;
-        self.departure.begin_silent(BootRequest::Owed(owed), now);
+        Ok(Reply::Send)
     }
 
     /// This program is good: it has heard its master, say, or a master has said so. Where the flash
@@ -472,7 +448,7 @@ impl ProgramControl {
     }
 
     fn check(&self, sub: u8) -> Result<(), Abort> {
-        if (1..=self.programs).contains(&sub) || Some(sub) == self.bootloader {
+        if (1..=self.programs()).contains(&sub) || Some(sub) == self.bootloader {
             Ok(())
         } else {
             Err(Abort::NO_SUB_INDEX)
@@ -482,6 +458,7 @@ impl ProgramControl {
 
 #[cfg(test)]
 mod tests {
+    use shared_abi::geometry::Region;
     use shared_abi::handoff::{BootInfo, ResetCause};
 
     use super::*;
@@ -509,7 +486,7 @@ mod tests {
         fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
             match number {
                 1 if self.confirmed > 0 => Ok(ProgramArgs { flags: 3, ..ProgramArgs::default() }),
-                2 => Ok(ProgramArgs { crc: 0x1122_3344, flags: 1, ..ProgramArgs::default() }),
+                2 => Ok(ProgramArgs { crc: 0x1122_3344, version: 7, flags: 1, ..ProgramArgs::default() }),
                 _ => Err(CallgateError::Refused(-7)),
             }
         }
@@ -545,9 +522,31 @@ mod tests {
         }
     }
 
+    /// A memory map with so many programs.
+    fn layout(programs: usize) -> &'static Layout {
+        const PROGRAMS: [Region; 3] = [Region::new(0x0802_0000, 0x2_0000); 3];
+        const fn with(programs: &'static [Region]) -> Layout {
+            Layout { programs, ..shared_abi::layout::stm32f407g_disc1::LAYOUT }
+        }
+        static LAYOUTS: [Layout; 3] =
+            [with(PROGRAMS.split_at(1).0), with(PROGRAMS.split_at(2).0), with(&PROGRAMS)];
+        &LAYOUTS[programs - 1]
+    }
+
     /// Program 1 of three.
     fn control(fresh: bool) -> ProgramControl {
-        ProgramControl::new(&Start { fresh, ..Start::new(None, DEFAULTS) }, 3, 0xCAFE)
+        ProgramControl::new(&Start { fresh, ..Start::new(None, DEFAULTS) }, layout(3), 0xCAFE)
+    }
+
+    /// What an upload reads, as a number.
+    fn read(
+        control: &ProgramControl,
+        index: u16,
+        sub: u8,
+        services: &mut impl Services,
+    ) -> Result<u64, Abort> {
+        let value = control.read(index, sub, services).unwrap()?;
+        Ok(value.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte)))
     }
 
     fn request_behind(control: &mut ProgramControl) -> Next<BootRequest> {
@@ -558,12 +557,22 @@ mod tests {
     #[test]
     fn each_object_tells_of_every_program() {
         let control = control(false);
-        let states: [_; 5] = core::array::from_fn(|sub| control.state(sub as u8, &mut { STORES }));
-        let none = Abort(0x0609_0011);
-        assert_eq!(states, [Err(none), Ok(1), Ok(0), Ok(3), Err(none)]);
-        let crcs: [_; 4] = core::array::from_fn(|sub| control.identification(sub as u8, &mut { STORES }));
-        assert_eq!(crcs, [Err(none), Ok(0xCAFE), Ok(0x1122_3344), Ok(0)]);
-        assert_eq!((control.flash_status(3), control.flash_status(4)), (Ok(0), Err(none)));
+        let none = Err(Abort(0x0609_0011));
+        let region = Ok(0x0002_0000_0802_0000);
+        for (index, values) in [
+            (0x1F51, [Ok(3), Ok(1), Ok(0), Ok(3), none]),
+            (0x1F56, [Ok(3), Ok(0xCAFE), Ok(0x1122_3344), Ok(0), none]),
+            (0x1F57, [Ok(3), Ok(0), Ok(0), Ok(0), none]),
+            (0x2004, [Ok(3), region, region, region, none]),
+            (0x2005, [Ok(3), Ok(0), Ok(7), Ok(0), none]),
+            // Nobody has told a date, nor the number of the bootloader.
+            (0x1F52, [Ok(2), Ok(0), Ok(0), none, none]),
+            (0x2007, [Ok(1), Ok(0), none, none, none]),
+        ] {
+            let read: [_; 5] = core::array::from_fn(|sub| read(&control, index, sub as u8, &mut { STORES }));
+            assert_eq!(read, values, "{index:04X}h");
+        }
+        assert!(control.read(0x1018, 1, &mut { STORES }).is_none());
     }
 
     /// The number of the bootloader follows those of the programs, with a gap on a lift (CiA 814-1 gives
@@ -584,27 +593,40 @@ mod tests {
         let none = Abort(0x0609_0011);
         for (programs, number) in [(1, 2), (1, 3), (2, 3)] {
             let start = Start { fresh: true, ..Start::new(Some(told(number)), DEFAULTS) };
-            let mut control = ProgramControl::new(&start, programs, 0xCAFE);
-            assert_eq!((control.highest(), control.bootloader()), (number, number));
-            assert_eq!(control.state(number, &mut Renewable), Ok(0));
-            assert_eq!(control.identification(number, &mut Renewable), Ok(0x0B00_710A));
-            assert_eq!(control.flash_status(number), Ok(0));
-            assert_eq!(control.info(number, &mut Renewable).map(|info| info.version), Ok(7));
-            let layout = &shared_abi::layout::stm32f407g_disc1::LAYOUT;
-            assert_eq!(control.region(number, layout).map(|home| home.base), Some(0x0801_0000));
+            let mut control = ProgramControl::new(&start, layout(programs.into()), 0xCAFE);
+            for (index, sub, value) in [
+                (0x2007, 1, u64::from(number)),
+                (0x1F51, 0, number.into()),
+                (0x1F51, number, 0),
+                (0x1F56, number, 0x0B00_710A),
+                (0x1F57, number, 0),
+                (0x2005, number, 7),
+                (0x1F52, 1, 15_671),
+                (0x1F52, 2, 66_615_000),
+            ] {
+                assert_eq!(read(&control, index, sub, &mut Renewable), Ok(value), "{index:04X}h/{sub}");
+            }
+            let home = read(&control, 0x2004, number, &mut Renewable).unwrap();
+            assert_eq!(home as u32, 0x0801_0000);
             for absent in (programs + 1..number).chain([number + 1, 255]) {
-                assert_eq!(control.state(absent, &mut Renewable), Err(none), "{absent}");
+                assert_eq!(read(&control, 0x1F51, absent, &mut Renewable), Err(none), "{absent}");
             }
             // What is the bootloader's to do, it does.
             for value in [1, 2, 0x83, 0x84] {
-                assert_eq!(control.write(number, &[value], 0, &mut Renewable), Err(STATE), "{value}");
+                assert_eq!(control.write(number, &[value], true, 0, &mut Renewable), Err(STATE), "{value}");
             }
-            assert_eq!(control.write(number, &[0], 0, &mut Renewable), Ok(Answer::Send), "it is stopped");
+            assert_eq!(
+                control.write(number, &[0], true, 0, &mut Renewable),
+                Ok(Reply::Send),
+                "it is stopped"
+            );
             assert_eq!(request_behind(&mut control), Next::Serve);
+            let mut cleared = control.clone();
+            assert_eq!(cleared.write(number, &[3], true, 0, &mut Renewable), Ok(Reply::Withhold));
             let owed = Owed { program: number, value: 3, node_id: 5 };
-            assert_eq!(control.write(number, &[3], 0, &mut Renewable), Ok(Answer::Withhold(owed)));
+            assert_eq!(request_behind(&mut cleared), Next::Leave(BootRequest::Owed(owed)));
             // It confirms no program: that is another sub-index.
-            assert_eq!(control.write(number, &[0x80], 0, &mut Renewable), Ok(Answer::Send));
+            assert_eq!(control.write(number, &[0x80], true, 0, &mut Renewable), Ok(Reply::Send));
             assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Stay));
         }
     }
@@ -624,7 +646,7 @@ mod tests {
             (2, &[1], 0x0800_0022),
         ] {
             let mut services = STORES;
-            assert_eq!(control.write(sub, data, 0, &mut services), Err(Abort(code)), "{sub} {data:X?}");
+            assert_eq!(control.write(sub, data, true, 0, &mut services), Err(Abort(code)), "{sub} {data:X?}");
             assert_eq!(services.confirmed, 0);
             assert_eq!(request_behind(&mut control), Next::Serve);
         }
@@ -633,7 +655,7 @@ mod tests {
     #[test]
     fn a_call_back_is_answered_and_the_device_leaves_behind_the_pause() {
         let mut control = control(false);
-        assert_eq!(control.write(1, &[0x80], 0, &mut { STORES }), Ok(Answer::Send));
+        assert_eq!(control.write(1, &[0x80], true, 0, &mut { STORES }), Ok(Reply::Send));
         assert_eq!(control.proceed(true, 1), Next::Serve);
         assert_eq!(control.proceed(true, 12), Next::Leave(BootRequest::Stay));
     }
@@ -643,9 +665,7 @@ mod tests {
         for (value, sub) in [(0, 1), (3, 2)] {
             let mut control = control(false);
             let owed = Owed { program: sub, value, node_id: 32 };
-            assert_eq!(control.write(sub, &[value], 0, &mut { STORES }), Ok(Answer::Withhold(owed)));
-            assert_eq!(control.proceed(true, 0), Next::Serve, "not before the answer was withheld");
-            control.leave_owed(owed, 0);
+            assert_eq!(control.write(sub, &[value], true, 0, &mut { STORES }), Ok(Reply::Withhold));
             assert_eq!(control.proceed(false, 0), Next::Wait);
             assert_eq!(control.proceed(true, 1), Next::Leave(BootRequest::Owed(owed)));
         }
@@ -655,8 +675,8 @@ mod tests {
     #[test]
     fn a_bootloader_that_cannot_answer_is_not_asked_to() {
         let mut in_segments = control(false);
-        assert_eq!(in_segments.write_answered(1, &[3], 0, &mut { STORES }), Err(STATE));
-        assert_eq!(in_segments.write_answered(1, &[0], 0, &mut { STORES }), Ok(()));
+        assert_eq!(in_segments.write(1, &[3], false, 0, &mut { STORES }), Err(STATE));
+        assert_eq!(in_segments.write(1, &[0], false, 0, &mut { STORES }), Ok(Reply::Send));
         let stopped = BootRequest::Owed(Owed { program: 1, value: 0, node_id: 0 });
         assert_eq!(request_behind(&mut in_segments), Next::Leave(stopped));
         let mut changed = control(false);
@@ -664,27 +684,32 @@ mod tests {
         let mut stored = control(false);
         stored.node_stored(Some(32), false);
         for mut control in [changed.clone(), stored, control(false).answering_itself()] {
-            assert_eq!(control.write(1, &[3], 0, &mut { STORES }), Err(STATE));
+            assert_eq!(control.write(1, &[3], true, 0, &mut { STORES }), Err(STATE));
             // Before it or after it, 80h makes no difference to the STOP.
             for value in [0x80, 0, 0x80] {
-                assert_eq!(control.write(1, &[value], 0, &mut { STORES }), Ok(Answer::Send), "it leaves");
+                assert_eq!(
+                    control.write(1, &[value], true, 0, &mut { STORES }),
+                    Ok(Reply::Send),
+                    "it leaves"
+                );
             }
             assert_eq!(request_behind(&mut control), Next::Leave(stopped));
         }
         // Stored, the new node-ID is the bootloader's as well.
         changed.node_stored(Some(33), true);
         let owed = Owed { program: 1, value: 3, node_id: 33 };
-        assert_eq!(changed.write(1, &[3], 0, &mut { STORES }), Ok(Answer::Withhold(owed)));
+        assert_eq!(changed.write(1, &[3], true, 0, &mut { STORES }), Ok(Reply::Withhold));
+        assert_eq!(request_behind(&mut changed), Next::Leave(BootRequest::Owed(owed)));
     }
 
     #[test]
     fn the_first_80h_to_a_fresh_program_confirms_it_and_the_second_calls_the_bootloader() {
         let mut control = control(true);
         let mut services = STORES;
-        assert_eq!(control.write(1, &[0x80], 0, &mut services), Ok(Answer::Send));
+        assert_eq!(control.write(1, &[0x80], true, 0, &mut services), Ok(Reply::Send));
         assert_eq!(services.confirmed, 1);
         assert_eq!(request_behind(&mut control), Next::Serve);
-        assert_eq!(control.write(1, &[0x80], 300, &mut services), Ok(Answer::Send));
+        assert_eq!(control.write(1, &[0x80], true, 300, &mut services), Ok(Reply::Send));
         assert_eq!((services.confirmed, control.proceed(true, 900)), (1, Next::Leave(BootRequest::Stay)));
     }
 
@@ -692,9 +717,9 @@ mod tests {
     fn a_confirmation_that_fails_is_told_and_the_next_80h_calls_the_bootloader() {
         let mut control = control(true);
         let mut fails = Fake { confirm: Err(CallgateError::Absent), ..STORES };
-        assert_eq!(control.write(1, &[0x80], 0, &mut fails), Err(Abort(0x0606_0000)));
+        assert_eq!(control.write(1, &[0x80], true, 0, &mut fails), Err(Abort(0x0606_0000)));
         assert_eq!(request_behind(&mut control), Next::Serve);
-        assert_eq!(control.write(1, &[0x80], 300, &mut fails), Ok(Answer::Send));
+        assert_eq!(control.write(1, &[0x80], true, 300, &mut fails), Ok(Reply::Send));
         assert_eq!(control.proceed(true, 900), Next::Leave(BootRequest::Stay));
     }
 
@@ -704,10 +729,10 @@ mod tests {
     fn a_confirmation_at_the_reset_is_kept_against_other_commands() {
         let mut control = control(true);
         let mut locked = LOCKS;
-        assert_eq!(control.write(1, &[0x80], 0, &mut locked), Ok(Answer::Send));
-        assert_eq!(control.write(1, &[0x80], 1, &mut locked), Ok(Answer::Send), "the same again");
+        assert_eq!(control.write(1, &[0x80], true, 0, &mut locked), Ok(Reply::Send));
+        assert_eq!(control.write(1, &[0x80], true, 1, &mut locked), Ok(Reply::Send), "the same again");
         for value in [0, 2, 3] {
-            assert_eq!(control.write(1, &[value], 2, &mut locked), Err(STATE), "{value}");
+            assert_eq!(control.write(1, &[value], true, 2, &mut locked), Err(STATE), "{value}");
         }
         control.nmt_reset(3);
         assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Confirm(1)));
@@ -716,7 +741,7 @@ mod tests {
         let mut stores = self::control(false);
         assert_eq!(stores.promise(stored, 0), Ok(()));
         for value in [0, 2, 3, 0x80] {
-            assert_eq!(stores.write(1, &[value], 2, &mut { LOCKS }), Err(STATE), "{value}");
+            assert_eq!(stores.write(1, &[value], true, 2, &mut { LOCKS }), Err(STATE), "{value}");
         }
         assert_eq!(request_behind(&mut stores), Next::Leave(stored));
     }
@@ -737,7 +762,7 @@ mod tests {
                 let mut control = control(false).asking(|| false);
                 let mut services = Fake { unconfirm: answer, ..STORES };
                 for _ in 0..1000 {
-                    assert_eq!(control.write(sub, &[value], 0, &mut services), Err(STATE), "{value}");
+                    assert_eq!(control.write(sub, &[value], true, 0, &mut services), Err(STATE), "{value}");
                 }
                 assert_eq!((control.leaving(), services.unconfirmed), (false, times), "{value} {answer:?}");
                 assert_eq!(request_behind(&mut control), Next::Serve);
@@ -750,36 +775,36 @@ mod tests {
         let (mut sealed, mut locks) = (control(true).asking(|| false), LOCKS);
         assert_eq!((sealed.confirm(0, &mut locks), sealed.restart(0)), (Err(STATE), Err(STATE)));
         assert_eq!((sealed.refused, locks.unconfirmed), (None, 0));
-        assert_eq!(sealed.write(1, &[0x80], 0, &mut locks), Err(STATE), "it needs a reset");
+        assert_eq!(sealed.write(1, &[0x80], true, 0, &mut locks), Err(STATE), "it needs a reset");
         assert_eq!((request_behind(&mut sealed), locks.unconfirmed), (Next::Serve, 1));
         sealed.may_leave = || true;
-        assert_eq!(sealed.write(1, &[0x80], 0, &mut locks), Ok(Answer::Send), "it still confirms");
+        assert_eq!(sealed.write(1, &[0x80], true, 0, &mut locks), Ok(Reply::Send), "it still confirms");
         assert_eq!(request_behind(&mut sealed), Next::Leave(BootRequest::Confirm(1)));
         // A confirmation after the refusal releases the program, and the window stays.
         let (mut fresh, mut services) = (control(true).asking(|| false), STORES);
-        assert_eq!(fresh.write(1, &[2], 0, &mut services), Err(STATE));
+        assert_eq!(fresh.write(1, &[2], true, 0, &mut services), Err(STATE));
         for _ in 0..1000 {
             assert_eq!(fresh.confirm(0, &mut services), Ok(()));
         }
         assert_eq!((services.confirmed, services.unconfirmed), (1, 2));
     }
 
-    /// It is asked once, before an answer is withheld. Where the client wrote in segments the
-    /// answer cannot be: STOP is a call then, and a CLEAR that is refused takes the yes back.
+    /// It is asked once, and not for a CLEAR in segments, which is refused before that.
     #[test]
     fn a_yes_is_final() {
-        for value in [0x80, 0, 2, 3] {
-            let mut control = control(false).asking(|| true);
-            let answer = control.write(1, &[value], 0, &mut { STORES }).unwrap();
-            assert!(control.leaving(), "{value}");
-            control.may_leave = || panic!("it was asked again");
-            if let Answer::Withhold(owed) = answer {
-                let mut in_segments = control.clone();
-                let taken = in_segments.write_answered(1, &[value], 0, &mut { STORES });
-                assert_eq!((taken.is_ok(), in_segments.leaving()), (value == 0, value == 0), "{value}");
-                control.leave_owed(owed, 0);
+        for (value, expedited) in
+            [0x80, 0, 2, 3].into_iter().flat_map(|value| [(value, true), (value, false)])
+        {
+            let is_refused = value == 3 && !expedited;
+            let says: fn() -> bool = if is_refused { || panic!("it was asked") } else { || true };
+            let mut control = control(false).asking(says);
+            let taken = control.write(1, &[value], expedited, 0, &mut { STORES });
+            assert_eq!((taken.is_ok(), control.leaving()), (!is_refused, !is_refused), "{value} {expedited}");
+            if is_refused {
+                continue;
             }
-            assert!(control.write(1, &[0x80], 5, &mut { STORES }).is_ok());
+            control.may_leave = || panic!("it was asked again");
+            assert!(control.write(1, &[0x80], true, 5, &mut { STORES }).is_ok());
             assert!(matches!(request_behind(&mut control), Next::Leave(_)) && control.leaving());
         }
     }
@@ -794,7 +819,7 @@ mod tests {
         assert_eq!(plain.restart(0), Ok(()));
         assert_eq!(request_behind(&mut plain), Next::Leave(BootRequest::PowerOn));
         let mut again = control(false);
-        assert_eq!(again.write(1, &[2], 0, &mut { STORES }), Ok(Answer::Send));
+        assert_eq!(again.write(1, &[2], true, 0, &mut { STORES }), Ok(Reply::Send));
         assert_eq!(request_behind(&mut again), Next::Leave(BootRequest::Start(1)));
     }
 
@@ -812,11 +837,10 @@ mod tests {
             }
         }
         let control = control(false);
-        assert_eq!((control.program(), control.highest(), control.bootloader()), (1, 3, 0));
         let second = Start { program: 2, ..Start::new(None, DEFAULTS) };
-        assert_eq!(ProgramControl::new(&second, 3, 0).program(), 2);
+        assert_eq!((control.program(), ProgramControl::new(&second, layout(3), 0).program()), (1, 2));
         for (flags, state) in [(0, 3), (2, 3), (0xFFFF_FFFE, 3), (1, 0), (3, 0)] {
-            assert_eq!(control.state(2, &mut NotInstalled(flags)), Ok(state), "{flags:#x}");
+            assert_eq!(read(&control, 0x1F51, 2, &mut NotInstalled(flags)), Ok(state), "{flags:#x}");
         }
     }
 }

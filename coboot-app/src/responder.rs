@@ -37,12 +37,11 @@ use crate::bootloader::Services;
 use crate::departure::has_reached;
 use crate::departure::Next;
 use crate::program_control::{
-    Answer, ProgramControl, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID,
+    ProgramControl, Reply, Value, PROGRAM_CONTROL, PROGRAM_REGION, PROGRAM_VERSION,
 };
 
 const DEVICE_NAME: u16 = 0x1008;
 const SOFTWARE_VERSION: u16 = 0x100A;
-const PROGRAM_VERSION: u16 = 0x2005;
 
 /// The values by which the device identifies itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,24 +96,11 @@ pub struct Responder {
     silent: bool,
 }
 
-/// The value of an object.
-enum Value<'v> {
-    /// 1 to 4 bytes, little-endian.
-    Number {
-        bytes: [u8; 4],
-        len: u8,
-    },
+/// The content of an object.
+enum Content<'v> {
+    /// 1 to 4 bytes.
+    Number(Value),
     Text(&'v [u8]),
-}
-
-impl Value<'_> {
-    const fn byte(value: u8) -> Self {
-        Self::Number { bytes: [value, 0, 0, 0], len: 1 }
-    }
-
-    const fn word(value: u32) -> Self {
-        Self::Number { bytes: value.to_le_bytes(), len: 4 }
-    }
 }
 
 /// A text that is being sent in segments.
@@ -304,8 +290,12 @@ impl Responder {
         services: &mut impl Services,
     ) -> Result<(u8, [u8; 4]), Abort> {
         match self.value(index, sub, services)? {
-            Value::Number { bytes, len } => Ok((0x43 | (4 - len) << 2, bytes)),
-            Value::Text(text) => {
+            Content::Number(value) => {
+                let mut bytes = [0; 4];
+                bytes[..value.len()].copy_from_slice(&value);
+                Ok((0x43 | (4 - value.len() as u8) << 2, bytes))
+            }
+            Content::Text(text) => {
                 let size = text.len() as u32;
                 self.sending = Some(Sending { index, sent: 0, toggle: 0 });
                 Ok((0x41, size.to_le_bytes()))
@@ -343,8 +333,8 @@ impl Responder {
     ) -> Result<Option<(u8, [u8; 4])>, Abort> {
         // An object that cannot be read does not exist.
         let own_len = match self.value(index, sub, services)? {
-            Value::Number { len, .. } => len,
-            Value::Text(_) => return Err(Abort::READ_ONLY),
+            Content::Number(value) => value.len(),
+            Content::Text(_) => return Err(Abort::READ_ONLY),
         };
         if !matches!((index, sub), (0x1017, 0) | (PROGRAM_CONTROL, 1..)) {
             return Err(Abort::READ_ONLY);
@@ -356,16 +346,12 @@ impl Responder {
             return Err(Abort::COMMAND);
         }
         // If the client does not give the size, the size of the object counts.
-        let len = if command & SIZE_TOLD == 0 { own_len } else { 4 - (command >> 2 & 3) };
-        let data = &data[..usize::from(len)];
+        let len = if command & SIZE_TOLD == 0 { own_len } else { 4 - usize::from(command >> 2 & 3) };
+        let data = &data[..len];
         if index == PROGRAM_CONTROL {
-            match self.control.write(sub, data, now, services)? {
-                Answer::Send => {}
-                Answer::Withhold(owed) => {
-                    self.control.leave_owed(owed, now);
-                    self.silent = true;
-                    return Ok(None);
-                }
+            if self.control.write(sub, data, true, now, services)? == Reply::Withhold {
+                self.silent = true;
+                return Ok(None);
             }
         } else {
             match data {
@@ -378,43 +364,34 @@ impl Responder {
         Ok(Some((0x60, [0; 4])))
     }
 
-    /// The value of an object.
-    fn value(&self, index: u16, sub: u8, services: &mut impl Services) -> Result<Value<'_>, Abort> {
+    /// The content of an object.
+    fn value(&self, index: u16, sub: u8, services: &mut impl Services) -> Result<Content<'_>, Abort> {
         let Device { device_type, vendor_id, product_code, revision, serial_number, heartbeat_ms, .. } =
             self.device;
-        Ok(match (index, sub) {
+        Ok(Content::Number(match (index, sub) {
             (0x1000, 0) => Value::word(device_type),
             (0x1001, 0) => Value::byte(0),
-            (DEVICE_NAME | SOFTWARE_VERSION, 0) => Value::Text(self.text(index).ok_or(Abort::NO_OBJECT)?),
-            (0x1017, 0) => {
-                let [low, high] = heartbeat_ms.to_le_bytes();
-                Value::Number { bytes: [low, high, 0, 0], len: 2 }
-            }
+            (DEVICE_NAME | SOFTWARE_VERSION, sub) => match (self.text(index), sub) {
+                (Some(text), 0) => return Ok(Content::Text(text)),
+                (Some(_), _) => return Err(Abort::NO_SUB_INDEX),
+                (None, _) => return Err(Abort::NO_OBJECT),
+            },
+            (0x1017, 0) => Value::half(heartbeat_ms),
             (0x1018, 0) => Value::byte(4),
             (0x1018, 1) => Value::word(vendor_id),
             (0x1018, 2) => Value::word(product_code),
             (0x1018, 3) => Value::word(revision),
             (0x1018, 4) => Value::word(serial_number),
-            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS | PROGRAM_VERSION, 0) => {
-                Value::byte(self.control.highest())
+            (0x1000 | 0x1001 | 0x1017 | 0x1018, _) => return Err(Abort::NO_SUB_INDEX),
+            // A program that a debugger wrote has no record in the bootloader, but a label.
+            (PROGRAM_VERSION, sub) if sub == self.control.program() => {
+                let of_label = self.device.label.map_or(0, |label| label.version);
+                Value::word(services.program_info(sub).map_or(of_label, |info| info.version))
             }
-            (PROGRAM_CONTROL, sub) => Value::byte(self.control.state(sub, services)?),
-            (PROGRAM_ID, sub) => Value::word(self.control.identification(sub, services)?),
-            (FLASH_STATUS, sub) => Value::word(self.control.flash_status(sub)?),
-            (PROGRAM_VERSION, sub) => Value::word(self.program_version(sub, services)?),
-            (PROGRAM_DATE, 0) => Value::byte(2),
-            (PROGRAM_DATE, 1) => Value::word(self.control.software_date()[0]),
-            (PROGRAM_DATE, 2) => Value::word(self.control.software_date()[1]),
-            (DEVICE_STATE, 0) => Value::byte(1),
-            (DEVICE_STATE, 1) => Value::byte(self.control.bootloader()),
-            (0x1000 | 0x1001 | 0x1017 | 0x1018 | PROGRAM_DATE | DEVICE_STATE, _) => {
-                return Err(Abort::NO_SUB_INDEX)
-            }
-            (DEVICE_NAME | SOFTWARE_VERSION, _) if self.text(index).is_some() => {
-                return Err(Abort::NO_SUB_INDEX)
-            }
-            _ => return Err(Abort::NO_OBJECT),
-        })
+            // It does not fit into four bytes.
+            (PROGRAM_REGION, _) => return Err(Abort::NO_OBJECT),
+            _ => self.control.read(index, sub, services).unwrap_or(Err(Abort::NO_OBJECT))?,
+        }))
     }
 
     /// The text of 1008h or 100Ah, if it has one.
@@ -425,16 +402,6 @@ impl Responder {
             _ => return None,
         };
         (!text.is_empty()).then_some(text)
-    }
-
-    /// 2005h: the bootloader's record of a program has its version. A program that a debugger wrote has
-    /// no record, but a label.
-    fn program_version(&self, sub: u8, services: &mut impl Services) -> Result<u32, Abort> {
-        // It exists for the same programs.
-        self.control.flash_status(sub)?;
-        let own = self.device.label.filter(|_| sub == self.control.program());
-        let of_label = own.map_or(0, |label| label.version);
-        Ok(self.control.info(sub, services).map_or(of_label, |info| info.version))
     }
 }
 
@@ -448,6 +415,7 @@ fn answer(command: u8, index: u16, sub: u8, [a, b, c, d]: [u8; 4]) -> [u8; 8] {
 mod tests {
     use proptest::prelude::*;
     use shared_abi::callgate::{CallgateError, ProgramArgs};
+    use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
     use shared_abi::warm_start::Owed;
 
     use super::*;
@@ -482,7 +450,7 @@ mod tests {
     fn before_boot_up(fresh: bool) -> Responder {
         let defaults = Defaults { node_id: Some(5), bit_rate: 125_000, serial_number: 0 };
         let start = Start { fresh, ..Start::new(None, defaults) };
-        Responder::new(DEVICE, 5, ProgramControl::new(&start, 2, 0x1234_5678)).unwrap()
+        Responder::new(DEVICE, 5, ProgramControl::new(&start, &LAYOUT, 0x1234_5678)).unwrap()
     }
 
     fn responder() -> Responder {

@@ -15,6 +15,7 @@ use emulator::time::{Span, Time};
 /// The segments of a sub-block at 125 kbit/s: as many as fit into 80 ms, with 135 bits each.
 const BLKSIZE: u8 = 74;
 const DATA: Address = Address::new(0x1F50, 1);
+const CONTROL: Address = Address::new(0x1F51, 1);
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const READ_1008: [u8; 8] = [0x40, 0x08, 0x10, 0, 0, 0, 0, 0];
 const READ_STATUS: [u8; 8] = [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0];
@@ -96,8 +97,7 @@ fn a_lost_last_segment_is_acknowledged_before_clients_give_up() {
 fn an_abandoned_block_download_locks_nobody_out() {
     let mut bootloader = board(BitRate::K125);
     let mut application = Bench::running(BitRate::K125, firmware::APP_V1);
-    let way_back = Address::new(0x2000, 0);
-    for (bench, at) in [(&mut bootloader, DATA), (&mut application, way_back)] {
+    for (bench, at) in [(&mut bootloader, DATA), (&mut application, CONTROL)] {
         let device_type = bench.ask(REQUEST, &READ_1000, RESPONSE).expect("an answer");
         for every in [100, 700, 2200] {
             for segments in [0, 3] {
@@ -125,14 +125,29 @@ fn an_abandoned_block_download_locks_nobody_out() {
     }
 }
 
+/// The server takes such a request after its pause, in no answer to a frame: the bootloader carries
+/// CLEAR out and confirms it all the same.
+#[test]
+fn a_clear_that_ends_an_abandoned_block_download_is_the_bootloaders() {
+    let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
+    abandon(&mut bench, CONTROL, BLKSIZE, 3);
+    bench.run_ms(5);
+    let answer = bench.ask(REQUEST, &CLEAR, RESPONSE);
+    assert_eq!(answer.as_deref(), Some(&[0x60, 0x51, 0x1F, 1, 0, 0, 0, 0][..]));
+    assert!(bench.is_bootloader(NODE));
+    bench.run_ms(10_000);
+    // 3: there is no program.
+    assert_eq!(bench.session().read_number(CONTROL).unwrap(), 3);
+}
+
 /// A transfer is abandoned, and a client sends a request every second: NMT reset node is carried
 /// out.
 #[test]
 fn reset_node_waits_for_no_transfer() {
     let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
     for (index, transfer) in [
-        (0x2000, [0xC0, 0x00, 0x20, 0, 0, 0, 0, 0]),
-        (0x2000, [0x21, 0x00, 0x20, 0, 1, 0, 0, 0]),
+        (0x1F51, [0xC0, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+        (0x1F51, [0x21, 0x51, 0x1F, 1, 1, 0, 0, 0]),
         (0x1008, READ_1008),
         (0x1008, [0xA0, 0x08, 0x10, 0, 127, 0, 0, 0]),
         (0x1F50, [0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0]),

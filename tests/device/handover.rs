@@ -13,7 +13,7 @@ use coflash_core::file::read::{read, Format};
 use coflash_core::update::steps::release;
 use coflash_core::update::{flash, FlashOptions};
 
-/// The application template's return (object 2000h): the value for the jump.
+/// The return of the tests' application (object 2000h): the value for the jump.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const JUMP: u8 = 2;
 
@@ -63,13 +63,6 @@ fn differences(found: &BTreeMap<u32, u32>, reset: &BTreeMap<u32, u32>) -> Vec<St
     differ.map(|(address, value)| format!("{address:08X}: {value:08X}, not {:08X}", reset[address])).collect()
 }
 
-/// A board that runs an application.
-fn running_board() -> Bench {
-    let mut bench = crate::device::running_board();
-    bench.events();
-    bench
-}
-
 /// The registers at the bootloader's first instruction after a reset.
 fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
     let first = stop_at_reset_of(bench, firmware::board().bootloader.base);
@@ -83,7 +76,9 @@ fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
 /// interrupts.
 #[test]
 fn the_bootloader_finds_the_chip_as_after_a_reset() {
-    let mut bench = running_board();
+    let mut bench = crate::device::empty_board();
+    bench.install(firmware::APP_TEST);
+    bench.events();
     bench.session().write(REENTRY_PATH, &[JUMP], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
     // An application that saves current: in sleep mode no clocks but those of the CAN controllers.
     for (register, value) in LOW_POWER.into_iter().zip([0, 0, 0, 3 << 25, 0_u32]) {

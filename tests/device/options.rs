@@ -123,7 +123,7 @@ fn block_download_has_the_products_sub_blocks_or_is_not_there() {
 fn an_update_keeps_the_cob_ids_of_the_product() {
     let mut bench = switched_on(NODE, BitRate::K500);
     bench.machine().set_pin('C', 0, Some(true));
-    for program in [firmware::APP_V1, firmware::APP_V2, firmware::APP_C] {
+    for program in [firmware::APP_V1, firmware::APP_V2, firmware::APP_C, firmware::APP_TEST] {
         let file = firmware::blocks(program);
         let options = FlashOptions::default();
         let report = with(&mut bench, |session| flash(session, &file, &options, &mut |_| {}).unwrap());

@@ -11,15 +11,20 @@ use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// Objects of the application template: the return, and its confirmation.
+/// Objects of the tests' application: the return, and its confirmation.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const CONFIRMATION: Address = Address::new(0x2001, 0);
 const INSTALLED: u32 = 1;
 const SIGNED: u32 = 2;
 
-/// A board that runs version 1.
+/// A board that runs the tests' application, on a chip whose LSI has this frequency.
+fn running_board_with(lsi_hz: u32) -> Bench {
+    let silicon = Silicon { lsi_hz, ..TYPICAL };
+    crate::standby::running_board(firmware::BOOTLOADER, firmware::APP_TEST, silicon, false)
+}
+
 fn running_board() -> Bench {
-    crate::standby::running_board(firmware::BOOTLOADER, TYPICAL, false)
+    running_board_with(TYPICAL.lsi_hz)
 }
 
 fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
@@ -71,8 +76,7 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
 fn each_way_back_is_short_with_the_slowest_and_the_fastest_lsi() {
     for lsi_hz in [17_000, 32_000, 47_000] {
         for (way, periods) in [(0, 0), (1, 5 + 2 * 4), (2, 0)] {
-            let mut bench =
-                crate::standby::running_board(firmware::BOOTLOADER, Silicon { lsi_hz, ..TYPICAL }, false);
+            let mut bench = running_board_with(lsi_hz);
             write(&mut bench, REENTRY_PATH, way).unwrap();
             bench.session().command(1, ProgramControl::StartBootloader).unwrap();
             let answered = bench.time();
@@ -264,7 +268,7 @@ fn a_program_that_was_confirmed_starts_without_a_rescue_window() {
     assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "a window that passes confirms nothing");
     bench.confirm_program();
     assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it was called back");
-    bench.install(firmware::APP_V2);
+    bench.install(firmware::APP_TEST);
     assert_eq!(bench.boot_ups(Bench::power_cycle), 2, "another program");
     write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
     assert_eq!(bench.boot_ups(Bench::power_cycle), 1, "it has confirmed itself");

@@ -16,11 +16,11 @@ const SCR: u32 = 0xE000_ED10;
 const STANDBY: u8 = 8;
 
 /// A board with a confirmed program that runs.
-pub(super) fn running_board(image: &str, silicon: Silicon, has_watchdog: bool) -> Bench {
+pub(super) fn running_board(image: &str, program: &str, silicon: Silicon, has_watchdog: bool) -> Bench {
     let mut bench = Bench::of_image_with(image, Options { silicon, ..Options::default() });
     bench.machine().set_hardware_watchdog(has_watchdog);
     let mut bench = bench.switched_on();
-    let blocks = firmware::blocks(firmware::APP_V1);
+    let blocks = firmware::blocks(program);
     // This program does not feed a watchdog: it would not live through the watch of the tool.
     let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
@@ -56,7 +56,7 @@ fn a_device_that_wakes_up_starts_its_program_each_time() {
         for flags_after_standby in [false, true] {
             let what = format!("{image}, watchdog {has_watchdog}, flags {flags_after_standby}");
             let silicon = Silicon { flags_after_standby, ..TYPICAL };
-            let mut bench = running_board(image, silicon, has_watchdog);
+            let mut bench = running_board(image, firmware::APP_V1, silicon, has_watchdog);
             // Twice as often as a program may crash.
             for wake in 1..=6 {
                 enter_standby(&mut bench);
@@ -82,7 +82,7 @@ fn a_device_that_wakes_up_starts_its_program_each_time() {
 /// Standby that the watchdog ends is a wake-up like any other: programs use it as an alarm.
 #[test]
 fn a_watchdog_that_ends_standby_is_no_crash() {
-    let mut bench = running_board(firmware::BOOTLOADER, TYPICAL, false);
+    let mut bench = running_board(firmware::BOOTLOADER, firmware::APP_V1, TYPICAL, false);
     for wake in 1..=6 {
         bench.machine().preset_watchdog(0x400);
         enter_standby(&mut bench);

@@ -203,11 +203,9 @@ fn a_program_that_never_feeds_its_watchdog_is_ended_after_a_second_of_the_lsi() 
 /// the request is kept.
 #[test]
 fn a_watchdog_does_not_survive_a_jump_into_the_bootloader() {
-    let mut bench = Bench::new();
-    bootloader_with_a_program(&mut bench);
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
-    // Object 2000h of the template: the way back, 2 for a jump.
+    let mut bench = Bench::new().switched_on();
+    bench.install(firmware::APP_TEST);
+    // Object 2000h of the tests' application: the way back, 2 for a jump.
     let way_back = Address::new(0x2000, 0);
     bench.session().write(way_back, &[2], Doing::Write(way_back), &mut |_| {}).unwrap();
     bench.events();

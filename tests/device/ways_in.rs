@@ -15,7 +15,7 @@ const TWO_RESETS: u8 = 13;
 
 /// A board with a confirmed program that runs.
 fn running_board(image: &str) -> Bench {
-    let mut bench = crate::standby::running_board(image, TYPICAL, false);
+    let mut bench = crate::standby::running_board(image, firmware::APP_V1, TYPICAL, false);
     bench.run_ms(20);
     bench
 }

@@ -83,7 +83,7 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     for command in [
         "set pagination off",
         &format!("target remote {}", desk.door.address()),
-        "break app_template::objects::{impl#1}::write",
+        "break app_template::objects::{impl#1}::write_with_reply",
         "continue",
         "backtrace 1",
         "delete",
@@ -112,7 +112,9 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
 
     let (said, told) = (fs::read_to_string(said).unwrap(), fs::read_to_string(told).unwrap());
     let mut rest = said.as_str();
-    for words in ["Breakpoint 1", "#0  app_template::objects::{impl#1}::write", "Breakpoint 2", "main + "] {
+    for words in
+        ["Breakpoint 1", "#0  app_template::objects::{impl#1}::write_with_reply", "Breakpoint 2", "main + "]
+    {
         let at = rest.find(words).unwrap_or_else(|| panic!("{words:?} is missing:\n{said}"));
         rest = &rest[at + words.len()..];
     }

@@ -171,7 +171,7 @@ fn a_sealed_program_cannot_open_flash_and_option_bytes() {
 /// Return by a jump: the flash is locked, and the boot stage does a reset.
 #[test]
 fn a_sealed_program_that_jumps_back_can_be_updated() {
-    let image = firmware::raw(firmware::APP_V1);
+    let image = firmware::raw(firmware::APP_TEST);
     let file = |counter| sealer(counter).seal(&image, &release()).unwrap();
     let mut bench = installed(board(), &file(COUNTER));
     bench.await_boot_up(2000);

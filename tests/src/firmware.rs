@@ -57,6 +57,8 @@ pub const APP_VIRTUAL_CAN: &str = "app-virtual-can.elf";
 pub const APP_V1: &str = "app-v1.elf";
 /// Version 2 of the application.
 pub const APP_V2: &str = "app-v2.elf";
+/// The template with what only tests need: 2000h, the way back, and 2001h, the state of the program.
+pub const APP_TEST: &str = "app-test.elf";
 /// Version 1 of the application with the debugger interface, which no product has.
 pub const APP_DEBUGGER: &str = "app-debugger.elf";
 /// Version 2 of the application for the region of the second program, on a board that has one.

@@ -14,7 +14,7 @@ use crate::bench::{Bench, NODE};
 use crate::firmware;
 
 const VERSION: Address = Address::new(0x100A, 0);
-/// Object 2000h of the application template: the way back.
+/// Object 2000h of the tests' application: the way back.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 /// A branch to itself (ARMv7-M A7.7.12).
 const HANG: u16 = 0xE7FE;
@@ -70,7 +70,7 @@ fn power_cycle(bench: &mut Bench) {
 /// Download, start, way back, download again.
 fn main_job(bench: &mut Bench, way: u8) {
     let options = FlashOptions::default();
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_TEST), &options, &mut |_| {}).unwrap();
     bench.session().write(REENTRY_PATH, &[way], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
     bench.events();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();

@@ -26,7 +26,7 @@ attack. The counts go to target/evidence/attacker.json.
 /// The images of the attack, on the board with two programs.
 const IMAGES: &str =
     "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can app-v1 \
-    app-v2 app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
+    app-v2 app-test app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
 
 pub fn run(mut args: Args) -> Outcome {
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);

@@ -83,6 +83,7 @@ pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader-debugger", "debugger"),
     bootloader("bootloader-sealed-debugger", "sealed,debugger"),
     application("app-debugger", "test-app", "debugger"),
+    application("app-test", "test-app", ""),
     // The unchanged template, in two versions.
     application("app-v1", "app-template", ""),
     application("app-v2", "app-template-v2", ""),

@@ -32,8 +32,8 @@ that fails ends it. A step that needs a hand asks for it at the terminal, or is 
   --bus URL       the bus, as coflash takes it: socketcan:can0. With {rate} in the place of the bit rate,
                   gs_usb:0@{rate}k or slcan:/dev/ttyACM0@{rate}k, the bit rates are tried, too
   --board BOARD   the board (default: stm32f407g-disc1)
-  --elf FILE      builds nothing: this bootloader, and app-v1.elf, app-v2.elf and bootloader-watchdog.elf in the same
-                  folder (target/firmware/BOARD of a build, or of a release)
+  --elf FILE      builds nothing: this bootloader, and app-v1.elf, app-v2.elf, app-test.elf and bootloader-watchdog.elf
+                  in the same folder (target/firmware/BOARD of a build, or of a release)
   --coflash FILE  the host tool for --elf (default: the one of this repository if it is built, or that of PATH)
   --probe COMMAND the command line for the debug probe (default: 'probe-rs {action} --chip {chip} {elf}').
                   {action} becomes download or reset, {chip} the chip, {elf} the file; for a reset the
@@ -77,7 +77,8 @@ pub fn run(mut args: Args) -> Outcome {
         }
         None => {
             setup::prepare(&[Part::Firmware])?;
-            let images = build::images(board, &[&build::MAIN[..], &["bootloader-watchdog"]].concat())?;
+            let images =
+                build::images(board, &[&build::MAIN[..], &["app-test", "bootloader-watchdog"]].concat())?;
             process::run(process::cargo("build --package coflash").current_dir(workspace::root()))?;
             (images.join("bootloader.elf"), built)
         }

@@ -4,7 +4,6 @@
 //! [`Node::poll`] until there are none. It calls `poll` again at least every few milliseconds (or
 //! at [`Node::next_deadline`]).
 
-use crate::abort::AbortCode;
 use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::heartbeat::Heartbeat;
@@ -102,16 +101,6 @@ impl Node {
     /// The bit rate of the bus, see [`bit_rate`](crate::sdo::server::Config::bit_rate).
     pub fn set_bit_rate(&mut self, bit_rate: BitRate) {
         self.sdo.set_bit_rate(bit_rate);
-    }
-
-    /// Withdraws the waiting SDO answer if it is `answer`; returns whether it was.
-    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
-        self.sdo.withdraw_answer(answer)
-    }
-
-    /// Replaces the waiting SDO answer by an abort for the same object.
-    pub fn refuse(&mut self, code: AbortCode) {
-        self.sdo.refuse(code);
     }
 
     /// Ends a running SDO transfer without a message to the client.

@@ -342,6 +342,16 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
     Ok(value.len())
 }
 
+/// What the SDO server does after an object has taken a download.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reply {
+    /// It confirms the download.
+    Send,
+    /// It sends nothing: another program of the device confirms in its place, as a bootloader does
+    /// after a reset.
+    Withhold,
+}
+
 /// The values of the table.
 ///
 /// Variables and strings are read and written as a whole. **Domains** are streamed, and the server
@@ -398,6 +408,19 @@ pub trait Objects {
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
         let _ = (at, data);
         Err(AbortCode::UNSUPPORTED_ACCESS)
+    }
+
+    /// Writes as [`write`](Self::write), and says who confirms: the server calls this one.
+    ///
+    /// `expedited`: the confirmation names the object and nothing else (CiA 301 clause 7.2.4.3.3), so
+    /// that another program can send it. That of segments and blocks belongs to the transfer: the
+    /// server sends it whatever this returns, and a device does what goes with that.
+    ///
+    /// # Errors
+    /// Sent to the client as abort.
+    fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
+        let _ = expedited;
+        self.write(at, data).map(|()| Reply::Send)
     }
 
     /// Starts a download of a domain, of `size` bytes if the client announced it.

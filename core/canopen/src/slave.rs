@@ -10,7 +10,6 @@
 //! The first actions of a new slave set filters and bit rate, so the owner has a single place for
 //! them.
 
-use crate::abort::AbortCode;
 use crate::bit_rate::{BitRate, Detector};
 use crate::frame::{CobId, Frame, NodeId};
 use crate::line::{Consequence, LineEvent, Losses, Monitor, Status};
@@ -126,19 +125,6 @@ impl Slave {
         self.config.node.heartbeat_ms = period_ms;
         if let Some(node) = &mut self.node {
             node.set_heartbeat_ms(period_ms, now);
-        }
-    }
-
-    /// Withdraws the waiting SDO answer if it is `answer`; returns whether it was. The device then
-    /// owes this answer to the client.
-    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
-        self.node.as_mut().is_some_and(|node| node.withdraw_answer(answer))
-    }
-
-    /// Replaces the waiting SDO answer by an abort for the same object.
-    pub fn refuse(&mut self, code: AbortCode) {
-        if let Some(node) = &mut self.node {
-            node.refuse(code);
         }
     }
 

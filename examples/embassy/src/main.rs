@@ -63,7 +63,7 @@ async fn main(spawner: Spawner) {
     let start = Start::read(&LAYOUT, defaults);
     let bootloader = Bootloader::new(&LAYOUT);
     let crc = bootloader.program_crc(start.program);
-    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc).asking(may_leave);
+    let control = ProgramControl::new(&start, &LAYOUT, crc).asking(may_leave);
     let device = Device {
         device_type: 0,
         name: NAME,

@@ -62,7 +62,7 @@ fn main() -> ! {
     let start = Start::read(&LAYOUT, defaults);
     let mut bootloader = Bootloader::new(&LAYOUT);
     let crc = bootloader.program_crc(start.program);
-    let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc).asking(may_leave);
+    let control = ProgramControl::new(&start, &LAYOUT, crc).asking(may_leave);
     let device = Device {
         device_type: 0,
         name: NAME,

@@ -3,9 +3,9 @@
 
 use core::sync::atomic::{AtomicU16, Ordering};
 
-use coboot_app::program_control::{DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID};
+use coboot_app::program_control::{PROGRAM_CONTROL, PROGRAM_REGION};
 use coboot_app::warm_start::BootRequest;
-use coboot_app::{Abort, Answer, Bootloader, Next, ProgramControl, Start};
+use coboot_app::{Abort, Bootloader, Next, ProgramControl, Reply, Start};
 
 use crate::device::{LAYOUT, PRODUCT_CODE, REVISION, VENDOR_ID};
 use crate::stack::{AbortCode, Confirmation, Dictionary, Value};
@@ -34,7 +34,7 @@ impl Objects {
     pub fn new(start: &Start, bootloader: Bootloader) -> Self {
         let crc = bootloader.program_crc(start.program);
         Self {
-            control: ProgramControl::new(start, LAYOUT.programs.len() as u8, crc).asking(may_leave),
+            control: ProgramControl::new(start, &LAYOUT, crc).asking(may_leave),
             bootloader,
             serial_number: start.serial_number,
             now: 0,
@@ -56,15 +56,6 @@ impl Dictionary for Objects {
     fn read(&mut self, index: u16, sub: u8) -> Result<Value, AbortCode> {
         let Self { control, bootloader, .. } = self;
         Ok(match (index, sub) {
-            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => value(&[control.highest()]),
-            (PROGRAM_CONTROL, sub) => value(&[control.state(sub, bootloader)?]),
-            (PROGRAM_ID, sub) => value(&control.identification(sub, bootloader)?.to_le_bytes()),
-            (FLASH_STATUS, sub) => value(&control.flash_status(sub)?.to_le_bytes()),
-            (PROGRAM_DATE, 0) => value(&[2]),
-            (PROGRAM_DATE, 1) => value(&control.software_date()[0].to_le_bytes()),
-            (PROGRAM_DATE, 2) => value(&control.software_date()[1].to_le_bytes()),
-            (DEVICE_STATE, 0) => value(&[1]),
-            (DEVICE_STATE, 1) => value(&[control.bootloader()]),
             // The device type: anything but the bootloader's.
             (0x1000, 0) => value(&[0; 4]),
             (0x1001, 0) => value(&[0]),
@@ -74,21 +65,24 @@ impl Dictionary for Objects {
             (0x1018, 3) => value(&REVISION.to_le_bytes()),
             (0x1018, 4) => value(&self.serial_number.to_le_bytes()),
             (0x2000, 0) => value(&BLINK_MS.load(Ordering::Relaxed).to_le_bytes()),
-            _ => return Err(AbortCode::NO_OBJECT),
+            // The stack has no transfer for the eight bytes of this one.
+            (PROGRAM_REGION, _) => return Err(AbortCode::NO_OBJECT),
+            _ => match control.read(index, sub, bootloader) {
+                Some(read) => value(&read?),
+                None => return Err(AbortCode::NO_OBJECT),
+            },
         })
     }
 
     fn write(&mut self, index: u16, sub: u8, data: &[u8]) -> Result<Confirmation, AbortCode> {
         match (index, sub) {
             (PROGRAM_CONTROL, sub) => {
-                match self.control.write(sub, data, self.now, &mut self.bootloader)? {
-                    Answer::Send => Ok(Confirmation::Send),
+                // The stack takes expedited downloads alone.
+                Ok(match self.control.write(sub, data, true, self.now, &mut self.bootloader)? {
+                    Reply::Send => Confirmation::Send,
                     // The bootloader carries the command out, and answers.
-                    Answer::Withhold(owed) => {
-                        self.control.leave_owed(owed, self.now);
-                        Ok(Confirmation::Withhold)
-                    }
-                }
+                    Reply::Withhold => Confirmation::Withhold,
+                })
             }
             (0x2000, 0) => {
                 let bytes = data.try_into().map_err(|_| AbortCode::LENGTH)?;

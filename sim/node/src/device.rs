@@ -434,7 +434,6 @@ impl Running<StandIn> {
         if self.slave.handle(frame, now, &mut self.device) {
             self.device.control.nmt_reset(now.as_millis());
         }
-        self.device.leave_owed(&mut self.slave);
     }
 
     /// Leaves with this request if it is time; otherwise sends the waiting frames.

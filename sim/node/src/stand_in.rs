@@ -6,20 +6,15 @@ use std::task::Poll;
 
 use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
-use boot_core::canopen::od::{put, Address, Entry, Objects};
-use boot_core::canopen::program::{
-    region_value, APPLICATION_STATE_ENTRIES, CONTROL_ARRAYS, DATE_ENTRIES, DEVICE_STATE, FLASH_STATUS,
-    PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
-};
-use boot_core::canopen::slave::{Slave, SlaveDevice};
+use boot_core::canopen::od::{put, Address, Entry, Objects, Reply};
+use boot_core::canopen::program::{APPLICATION_STATE_ENTRIES, CONTROL_ARRAYS, DATE_ENTRIES, PROGRAM_CONTROL};
+use boot_core::canopen::slave::SlaveDevice;
 use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters as _, ProgramRecord};
 use coboot_app::callgate::{CallgateError, ProgramArgs, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED};
-use coboot_app::{Answer, Confirmed, ProgramControl, Services, Start};
-use shared_abi::geometry::Region;
+use coboot_app::{Confirmed, ProgramControl, Services, Start};
 use shared_abi::layout::Layout;
-use shared_abi::warm_start::Owed;
 
 use crate::file_flash::FileFlash;
 
@@ -36,8 +31,6 @@ pub struct StandIn {
     /// 1F51h, 1F56h, 1F57h, and the way back.
     pub control: ProgramControl,
     underneath: Underneath,
-    /// An answer that the SDO server has yet to withhold.
-    owed: Option<Owed>,
     /// The time that was set last.
     now: Instant,
 }
@@ -96,9 +89,9 @@ impl StandIn {
         let device = Device { device_type: DEVICE_TYPE, software_version: SOFTWARE_VERSION, ..bootloader };
         let mut underneath = Underneath { flash, layout };
         let crc = underneath.program_info(start.program).map_or(0, |info| info.crc);
-        let control = ProgramControl::new(start, layout.programs.len() as u8, crc);
+        let control = ProgramControl::new(start, layout, crc);
         let control = if hands_over { control } else { control.answering_itself() };
-        Self { entries, device, control, underneath, owed: None, now: Instant::from_millis(0) }
+        Self { entries, device, control, underneath, now: Instant::from_millis(0) }
     }
 
     /// Its object dictionary on a device with this many programs.
@@ -126,19 +119,6 @@ impl StandIn {
         self.now = now;
     }
 
-    /// To be called after every frame: takes an answer back that the bootloader is to send. Where the
-    /// client has written in segments that cannot be, so the command is judged once more.
-    pub fn leave_owed(&mut self, slave: &mut Slave) {
-        let Some(owed) = self.owed.take() else { return };
-        let now = self.now.as_millis();
-        let Owed { program, value, .. } = owed;
-        if slave.withdraw_answer(&[0x60, 0x51, 0x1F, program, 0, 0, 0, 0]) {
-            self.control.leave_owed(owed, now);
-        } else if let Err(abort) = self.control.write_answered(program, &[value], now, &mut self.underneath) {
-            slave.refuse(abort.into());
-        }
-    }
-
     /// The flash of the device.
     pub fn flash(&mut self) -> &mut FileFlash {
         &mut self.underneath.flash
@@ -160,37 +140,18 @@ impl Objects for StandIn {
         if let Some(read) = self.device.read(at, buf) {
             return read;
         }
-        let Self { control, underneath, .. } = self;
-        match at.index {
-            PROGRAM_CONTROL => put(buf, &[control.state(at.sub, underneath)?]),
-            PROGRAM_ID => put(buf, &control.identification(at.sub, underneath)?.to_le_bytes()),
-            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
-            DEVICE_STATE => put(buf, &[control.bootloader()]),
-            PROGRAM_DATE => {
-                let [date, time] = control.software_date();
-                put(buf, &if at.sub == 1 { date } else { time }.to_le_bytes())
-            }
-            PROGRAM_REGION => {
-                let Region { base, size } = underneath.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
-                put(buf, &region_value(base, size))
-            }
-            PROGRAM_VERSION => {
-                let version = underneath.program_info(at.sub).map_or(0, |info| info.version);
-                put(buf, &version.to_le_bytes())
-            }
-            _ => Err(AbortCode::NO_DATA),
+        match self.control.read(at.index, at.sub, &mut self.underneath) {
+            Some(value) => put(buf, &value?),
+            None => Err(AbortCode::NO_DATA),
         }
     }
 
-    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+    fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
         if at.index != PROGRAM_CONTROL {
             return Err(AbortCode::UNSUPPORTED_ACCESS);
         }
-        match self.control.write(at.sub, data, self.now.as_millis(), &mut self.underneath)? {
-            Answer::Send => {}
-            Answer::Withhold(owed) => self.owed = Some(owed),
-        }
-        Ok(())
+        let now = self.now.as_millis();
+        Ok(self.control.write(at.sub, data, expedited, now, &mut self.underneath)?.into())
     }
 }
 

@@ -1,7 +1,7 @@
 //! A device for the tests, and the wire between both ends.
 
 use canopen::frame::Channel;
-use canopen::od::{put, Access, DataType, Entry};
+use canopen::od::{put, Access, DataType, Entry, Reply};
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId, Objects};
 
@@ -73,6 +73,8 @@ pub struct DeviceOf<const SECOND: bool> {
     pub reserve: usize,
     /// Whether it refuses the end of a domain download.
     pub refuse_end: Option<AbortCode>,
+    /// Whether it leaves the confirmations of expedited downloads to another program.
+    pub withholds: bool,
     /// The second SDO server, if it has one.
     pub second: Option<Channel>,
 }
@@ -118,6 +120,11 @@ impl<const SECOND: bool> Objects for DeviceOf<SECOND> {
             _ => panic!("the table does not allow a write of {at}"),
         }
         Ok(())
+    }
+
+    fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
+        self.write(at, data)?;
+        Ok(if self.withholds && expedited { Reply::Withhold } else { Reply::Send })
     }
 
     fn download_start(&mut self, _at: Address, size: Option<u32>) -> Result<(), AbortCode> {

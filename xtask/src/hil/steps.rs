@@ -23,7 +23,7 @@ pub const STEPS: [Step; 21] = [
     ("option bytes: 2007h/6", option_bytes),
     ("the update suite: coflash conform UPD --install", update_suite),
     // The main job, as `cargo xtask demo` shows it.
-    ("install version 1", |bench| install(bench, V1)),
+    ("install the program of the tests", |bench| install(bench, TEST)),
     ("way back by a reset", |bench| way_back(bench, "0")),
     ("way back by the watchdog", |bench| way_back(bench, "1")),
     ("way back by a jump", |bench| way_back(bench, "2")),
@@ -41,6 +41,8 @@ pub const STEPS: [Step; 21] = [
 
 const V1: &str = "app-v1.elf";
 const V2: &str = "app-v2.elf";
+/// The template with 2000h, the way back.
+const TEST: &str = "app-test.elf";
 /// The bootloader of the product with `program_watchdog_ms: Some(1000)`.
 const WITH_WATCHDOG: &str = "bootloader-watchdog.elf";
 
@@ -164,7 +166,7 @@ fn runs_installed(bench: &Bench) -> Outcome {
     Err(format!("the program in the device has CRC {held:?}, and the installed one {:?}.", bench.installed))
 }
 
-/// Calls the application back by this way (2000h of the template), and measures it. The answer is on the bus
+/// Calls the application back by this way (its 2000h), and measures it. The answer is on the bus
 /// 10 ms before the device leaves, and the bootloader comes within milliseconds by each way (docs/bench.md); the watchdog's time after a reset, 349 to 964 ms, would be a mistake.
 fn way_back(bench: &mut Bench, way: &str) -> Outcome<Done> {
     bench.coflash.call(&["write", "2000", way, "--type", "u8"])?.good()?;

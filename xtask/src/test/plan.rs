@@ -30,7 +30,7 @@ pub struct Images {
 }
 
 /// The images for a board of another chip.
-const OF_A_CHIP: &str = "bootloader bootloader-paulus bootloader-watchdog app-v1 app-v2";
+const OF_A_CHIP: &str = "bootloader bootloader-paulus bootloader-watchdog app-v1 app-v2 app-test";
 
 /// The images for the board with two programs.
 const OF_TWO_PROGRAMS: &str =

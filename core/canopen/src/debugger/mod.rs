@@ -36,7 +36,7 @@ use crate::bit_rate::BitRate;
 use crate::frame::{Channel, NodeId};
 use crate::line::LineEvent;
 use crate::lss::{LssDevice, StoreError};
-use crate::od::{put, Access, Address, DataType, Entry, Objects};
+use crate::od::{put, Access, Address, DataType, Entry, Objects, Reply};
 use crate::program::ERROR_REGISTER;
 use crate::slave::SlaveDevice;
 
@@ -317,12 +317,12 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
         }
     }
 
-    fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
+    fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
         if at != COMMAND {
-            return self.device.write(at, data);
+            return self.device.write_with_reply(at, data, expedited);
         }
         let outcome = self.debugger.command(data);
-        self.debugger.noted(outcome)
+        self.debugger.noted(outcome).map(|()| Reply::Send)
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {

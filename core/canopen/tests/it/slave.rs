@@ -411,24 +411,17 @@ fn activates_a_bit_rate_and_keeps_silent_meanwhile() {
     assert_eq!(bench.outputs(), [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
 }
 
-/// What the owner does with an answer that waits.
+/// The owner restarts the device when it is idle.
 #[test]
-fn an_answer_that_waits_can_be_withdrawn_or_refused() {
-    let asked = [0x40, 0, 0x10, 0, 0, 0, 0, 0];
-    let answer = [0x43, 0, 0x10, 0, 1, 2, 3, 4];
+fn a_slave_is_idle_when_no_answer_waits() {
     let mut bench = Bench::new(5, BitRate::K125);
-    assert!(!bench.slave.withdraw_answer(&answer) && bench.slave.node().is_none());
+    assert!(bench.slave.node().is_none() && bench.slave.is_idle());
     bench.outputs();
     assert_eq!(bench.slave.node().map(|node| node.id().get()), Some(5));
-    bench.put(0x605, &asked);
-    assert!(!bench.slave.withdraw_answer(&[0x43, 0, 0x10, 0, 1, 2, 3, 5]), "another answer");
+    bench.put(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
     assert!(!bench.slave.is_idle());
-    assert!(bench.slave.withdraw_answer(&answer));
+    assert_eq!(bench.outputs(), [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
     assert!(bench.slave.is_idle());
-    assert_eq!(bench.outputs(), []);
-    bench.put(0x605, &asked);
-    bench.slave.refuse(AbortCode::DEVICE_STATE);
-    assert_eq!(bench.outputs(), [send(0x585, &[0x80, 0, 0x10, 0, 0x22, 0x00, 0x00, 0x08])]);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! | file | what it adds |
 //! |---|---|
 //! | `main.rs` | the tasks of the template; CAN over the UART, and a second version |
-//! | `device.rs` | the objects of a lift and of the debugger |
+//! | `device.rs` | the objects of a lift and of the debugger, 2000h and 2001h |
 //! | `debugger.rs` | the debugger interface with breakpoints (feature `debugger`) |
 //! | `no_debugger.rs` | nothing, in its place |
 //!
@@ -50,13 +50,12 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use app_template::objects::{Application, HEARTBEAT_MS};
+    use app_template::bus::carry_out;
     use bsp::clock::Source;
-    use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
-    use canopen::node::{self, NmtPolicy};
-    use canopen::slave::{self, Slave, SlaveDevice};
-    use canopen::{BitRate, Frame, Instant, NodeId};
-    use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
+    use bsp::{line, pac, CanPort, LAYOUT};
+    use canopen::slave::Slave;
+    use canopen::{Frame, Instant};
+    use coboot_app::{Bootloader, Exit, Next};
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use rtic_monotonics::fugit::ExtU32;
@@ -70,11 +69,6 @@ mod app {
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// The bit rate that the program uses when no bootloader has started it.
-    const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
-        Some(rate) => rate,
-        None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
-    };
     /// How the device is to leave: from the protocol task to `idle`, where no exception is active.
     static EXIT: Exit = Exit::new();
 
@@ -105,39 +99,12 @@ mod app {
         let can = CanPort::new(board.uart, Source::Crystal);
         Mono::start(bsp::cleared_systick(cx.core.SYST), bsp::SYSCLK);
 
-        // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
-        // with the application.
-        let start = Start::read(
-            LAYOUT,
-            Defaults {
-                node_id: NodeId::new(NODE_ID).map(NodeId::get),
-                bit_rate: BIT_RATE,
-                serial_number: bsp::serial_number(),
-            },
-        );
-        let node_id = start.node_id.and_then(NodeId::new);
-        let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
-        let device = Device::new(&start, bit_rate, VERSION);
-        let config = slave::Config {
-            node: node::Config {
-                heartbeat_ms: HEARTBEAT_MS,
-                nmt: NmtPolicy::Follow,
-                ..node::Config::default()
-            },
-            ..slave::Config::default()
-        };
+        let (device, slave) = Device::start(VERSION);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         (
             Shared { can },
-            Local {
-                received,
-                to_handle,
-                slave: Slave::new(device.application.lss_address(), node_id, bit_rate, config),
-                device,
-                debugger: debugger::start(),
-                led: board.led,
-            },
+            Local { received, to_handle, slave, device, debugger: debugger::start(), led: board.led },
         )
     }
 
@@ -165,12 +132,9 @@ mod app {
         let protocol::SharedResources { mut can, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, device, debugger, .. } = cx.local;
         device.set_time(now);
-        if !serves(slave, &mut can, &mut device.application) {
-            return;
-        }
         let status = can.lock(line::status);
         debugger.with(device, |device| slave.observe(status, now, device));
-        loop {
+        while serves(slave, &mut can, device) {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
             // that wait after it.
             debugger.with(device, |device| carry_out(slave, &mut can, now, device));
@@ -178,37 +142,21 @@ mod app {
             if debugger.with(device, |device| slave.handle(&frame, now, device)) {
                 device.application.control.nmt_reset(now.as_millis());
             }
-            device.application.leave_owed(slave);
-            if !serves(slave, &mut can, &mut device.application) {
-                return;
-            }
         }
     }
 
     /// Advances the departure, if one is in progress. Returns whether requests are served.
-    fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, application: &mut Application) -> bool {
+    fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, device: &mut Device) -> bool {
         let bus_idle = slave.is_idle() && can.lock(CanPort::is_idle);
-        match application.proceed(bus_idle) {
+        match device.application.proceed(bus_idle) {
             Next::Serve => return true,
             Next::Wait => {}
             Next::Leave(request) => {
-                EXIT.ask(application.path(request), request);
+                EXIT.ask(device.path(request), request);
                 debugger::release_program();
             }
         }
         false
-    }
-
-    /// Carries out the slave's actions until there are none left.
-    fn carry_out(
-        slave: &mut Slave,
-        can: &mut impl Mutex<T = CanPort>,
-        now: Instant,
-        device: &mut impl SlaveDevice,
-    ) {
-        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), device) {
-            can.lock(|can| line::carry_out(can, output));
-        }
     }
 
     /// Lets time pass for the protocol, and shows life.

@@ -123,7 +123,7 @@ impl SdoServer {
         };
         let data = receiver.finish(fields::unused_of_blocks(bytes[0]), fields::crc(bytes))?;
         self.take(&data, objects)?;
-        self.finish_download(objects)?;
+        self.finish_download(false, objects)?;
         self.answer_transfer(scs::END_BLOCK_DOWNLOAD, 0, 0);
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! Data from the client to the device.
 
 use crate::abort::AbortCode;
-use crate::od::{Address, DataType, Objects};
+use crate::od::{Address, DataType, Objects, Reply};
 
 use super::value::VALUE_MAX;
 use crate::sdo::block::SEGMENT;
@@ -102,12 +102,13 @@ impl Incoming {
         &self,
         at: Address,
         value: &[u8; VALUE_MAX],
+        expedited: bool,
         objects: &mut impl Objects,
-    ) -> Result<(), AbortCode> {
+    ) -> Result<Reply, AbortCode> {
         if self.is_domain() {
-            objects.download_end(at)
+            objects.download_end(at).map(|()| Reply::Send)
         } else {
-            objects.write(at, &value[..self.received as usize])
+            objects.write_with_reply(at, &value[..self.received as usize], expedited)
         }
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! - Frames with another identifier, remote and extended frames, and frames with another length
 //!   than 8 bytes are not SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
-//! - Every request is answered or aborted, except for an abort.
+//! - Every request is answered or aborted, except for an abort, and for an expedited download whose
+//!   confirmation the device leaves to another program ([`Reply::Withhold`](crate::od::Reply)).
 //! - An initiate ends the previous transfer. Within a sub-block of a block download it must first
 //!   be distinguished from a segment, see `block_download.rs`.
 //! - If the client is silent for the time-out, the transfer is aborted with 05040000h. In a block
@@ -238,19 +239,6 @@ impl SdoServer {
             State::Idle => None,
             _ if self.is_within() => Some(timeout.earlier(self.heard + self.pause_ms())),
             _ => Some(timeout),
-        }
-    }
-
-    /// Withdraws the waiting answer if it is `answer`; returns whether it was. The caller then owes
-    /// this answer to the client.
-    pub fn withdraw_answer(&mut self, answer: &[u8; 8]) -> bool {
-        self.answer.take_if(|waiting| waiting == answer).is_some()
-    }
-
-    /// Replaces the waiting answer by an abort for the same object.
-    pub fn refuse(&mut self, code: AbortCode) {
-        if self.answer.is_some() {
-            self.answer_initiate(fields::ABORT, code.0);
         }
     }
 

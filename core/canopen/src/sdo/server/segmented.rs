@@ -1,7 +1,7 @@
 //! Expedited and segmented transfers.
 
 use crate::abort::AbortCode;
-use crate::od::{self, Access, Address, DataType, Entry, Kind, Objects};
+use crate::od::{self, Access, Address, DataType, Entry, Kind, Objects, Reply};
 use crate::sdo::fields::{self, scs};
 
 use super::{Incoming, Outgoing, SdoServer, State, VALUE_MAX};
@@ -26,11 +26,11 @@ impl SdoServer {
         };
         let incoming = Incoming::start(at, data_type, size, objects)?;
         self.state = State::Download { incoming, toggle: false };
+        self.answer_initiate(scs::INITIATE_DOWNLOAD, 0);
         if let (true, Some(size)) = (expedited, size) {
             self.take(&fields::data(bytes)[..size as usize], objects)?;
-            self.finish_download(objects)?;
+            self.finish_download(true, objects)?;
         }
-        self.answer_initiate(scs::INITIATE_DOWNLOAD, 0);
         Ok(())
     }
 
@@ -46,7 +46,7 @@ impl SdoServer {
         alternate(toggle, command)?;
         self.take(&bytes[1..8 - usize::from(fields::unused_of_7(command))], objects)?;
         if command & fields::LAST != 0 {
-            self.finish_download(objects)?;
+            self.finish_download(false, objects)?;
         }
         self.answer_transfer(scs::DOWNLOAD_SEGMENT | command & fields::TOGGLE, 0, 0);
         Ok(())
@@ -145,13 +145,21 @@ impl SdoServer {
         incoming.take(self.at, data, &mut self.value, objects)
     }
 
-    /// All data have arrived: the object accepts or refuses them.
-    pub(super) fn finish_download(&mut self, objects: &mut impl Objects) -> Result<(), AbortCode> {
+    /// All data have arrived: the object accepts or refuses them. The answer to an `expedited`
+    /// download waits already: the object may withhold it.
+    pub(super) fn finish_download(
+        &mut self,
+        expedited: bool,
+        objects: &mut impl Objects,
+    ) -> Result<(), AbortCode> {
         let incoming = *self.state.incoming().ok_or(AbortCode::COMMAND)?;
         incoming.check()?;
         // The object gets the end, so it must not get a cancellation after it.
         self.state = State::Idle;
-        incoming.finish(self.at, &self.value, objects)
+        if incoming.finish(self.at, &self.value, expedited, objects)? == Reply::Withhold {
+            self.answer = None;
+        }
+        Ok(())
     }
 }
 
