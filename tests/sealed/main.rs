@@ -2,7 +2,6 @@
 #![cfg(split_map)]
 
 mod access;
-mod attacker;
 mod blocks;
 mod client;
 mod confirmation;
@@ -13,7 +12,6 @@ mod dictionary;
 mod flash_lock;
 mod model;
 mod pieces;
-mod powercut;
 mod provisioning;
 mod refusals;
 #[cfg(staging)]

@@ -10,7 +10,6 @@ mod dialects;
 mod fleet;
 mod main_job;
 mod masters;
-mod powercut;
 mod powercut_board;
 #[cfg(reference_board)]
 mod recording;

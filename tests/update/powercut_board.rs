@@ -1,7 +1,7 @@
 //! Proof by power cut, level 2: the built firmware on the emulated chip.
 
 use coboot_tests::firmware;
-use coboot_tests::powercut::board::{operations, prove, run, scenarios, Effort, Point};
+use coboot_tests::powercut::{operations, prove, run, scenarios, Effort};
 use emulator::machine::{Cut, Operation};
 
 #[test]
@@ -56,25 +56,6 @@ fn a_cut_shows_an_order_of_operations_that_is_wrong() {
     for wrong in [early, late] {
         let told = told(&wrong);
         assert!(told.iter().any(|what| what.contains("is not what it says")), "{told:?}");
-    }
-}
-
-#[test]
-fn a_point_of_the_board_is_written_and_read() {
-    for text in ["board:update:37:torn", "board:store:3:before:2:after"] {
-        assert_eq!(text.parse::<Point>().unwrap().to_string(), text);
-    }
-    for wrong in [
-        "",
-        "board",
-        "board:update:1",
-        "update:1:torn",
-        "board:nothing:1:torn",
-        "board:raw:x:torn",
-        "board:raw:1:broken",
-        "board:raw:1:torn:2",
-    ] {
-        assert!(wrong.parse::<Point>().is_err(), "{wrong}");
     }
 }
 

@@ -57,10 +57,10 @@ const RULES: &[(&str, &str)] = &[
     (KIT, "boot-core canopen coboot-app coboot-can seal shared-abi"),
     (
         "coboot-tests",
-        "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",
+        "app-template attack boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",
     ),
-    ("attack", "boot-core canopen coflash-core shared-abi kit"),
-    ("coboot-fuzz", "boot-core canopen coboot-can coflash-conform coflash-core coflash-ui seal shared-abi kit"),
+    ("attack", "boot-core canopen coflash-core seal shared-abi kit"),
+    ("coboot-fuzz", "attack boot-core canopen coboot-can coflash-conform coflash-core coflash-ui seal shared-abi kit"),
     ("coboot-zencan", "bsp canopen coboot-can coboot-tests coflash-core emulator"),
     ("new-board", "shared-abi"),
     ("xtask", "new-board shared-abi kit"),

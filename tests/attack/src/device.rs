@@ -30,6 +30,10 @@ pub enum Action {
     Upload { sub: u8 },
     /// LSS: this node-ID is stored.
     Store(u8),
+    /// A client asks a sealed device for these rights (2002h), in the name of a key.
+    Right(Holder, u32),
+    /// This program has brought the device back to the bootloader.
+    Return(u8),
     /// So many steps of the bootloader's own work.
     Run(u32),
     /// All of its work.
@@ -38,6 +42,8 @@ pub enum Action {
     Wait(u32),
     /// NMT: reset node.
     ResetNode,
+    /// A reset by the watchdog.
+    Crash,
     /// The power goes, and returns.
     PowerOff,
     /// So many flash operations later there is trouble.
@@ -58,6 +64,14 @@ impl Action {
     }
 }
 
+/// Whose key signs a request for rights. A root alone may.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Holder {
+    Root,
+    Release,
+    Stranger,
+}
+
 /// What happens in a flash operation.
 #[derive(Clone, Copy, Debug)]
 pub enum Trouble {
@@ -74,7 +88,7 @@ pub enum Trouble {
 }
 
 /// A program as a debug probe finds it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stored {
     /// It has no record.
     None,
@@ -98,6 +112,21 @@ pub struct Program {
     pub status: u32,
     /// Whether a part of its flash has the CRC of 1F56h, or none is told.
     pub is_true: bool,
+    /// Its lowest security counter.
+    pub counter: u32,
+    /// After a reset, the download that goes on (2006h).
+    pub partial: Option<Partial>,
+}
+
+/// A download that goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Partial {
+    /// The CRC of its control block.
+    pub id: u32,
+    /// So many bytes are in flash, as the device says; more than the flash of the program has: no place in it.
+    pub len: usize,
+    /// The CRC of these bytes in flash.
+    pub crc: u32,
 }
 
 /// A device as a debug probe finds it, if it were reset now, and as it tells it.
@@ -117,6 +146,9 @@ pub struct Seen {
     pub is_staged: bool,
     /// The programs, number 1 first.
     pub programs: Vec<Program>,
+    /// The program that starts after a power-on, and whether it is whole and released. (Program 1 alone starts by
+    /// itself.)
+    pub starting: Option<(u8, bool)>,
     /// The stored node-ID and bit rate.
     pub node: NodeParameters,
     /// Whether the last values of LSS are stored, as the device says.
@@ -129,6 +161,8 @@ pub struct Seen {
     pub read_back: Option<u32>,
     /// Whether there was no work at the end of the last action.
     pub is_idle: bool,
+    /// Whether the power was cut in the last action.
+    pub is_cut: bool,
     /// Whether no bit of the records is between 0 and 1, so that they read the same each time.
     pub is_certain: bool,
 }

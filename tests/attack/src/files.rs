@@ -4,12 +4,14 @@ use std::cell::RefCell;
 use std::collections::HashMap;
 use std::rc::Rc;
 
-use coflash_core::file::sealed::{key_block, Sealer, SigningKey};
+use coflash_core::file::sealed::{Certificate, Sealer};
 use kit::random::Random;
 use kit::renewal::{crc_of, image_of, BOARD, HOME, SOUND, STAGING};
 use kit::rig::{block, crc32, hex, program, words, Setup, PRODUCT_CODE, VENDOR_ID};
 use shared_abi::ram_image::Header;
 use shared_abi::renewal::BOOTLOADER;
+
+use crate::sealed::{certificate, keys, sealer, Parts};
 
 /// What a download contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -18,9 +20,50 @@ pub enum Content {
     Image(u8),
     /// A program with this number, for its place.
     Program(u8, Extent),
+    /// The same in the size, with the security counter and in the form of this row of [`RELEASES`].
+    Release(u8, u8),
     /// Bytes of this seed. Some begin as valid data do.
     Noise(u64),
+    /// Bytes that a fuzzer has chosen: see [`free`].
+    Free(usize),
 }
+
+/// Bytes, security counter, and whether it is encrypted and compressed.
+pub const RELEASES: [(usize, u32, (bool, bool)); 6] = [
+    (8, 3, (false, false)),
+    (300, 3, (true, false)),
+    (560, 5, (false, false)),
+    (1500, 5, (false, true)),
+    (900, 7, (true, true)),
+    (700, 9, (true, false)),
+];
+/// The security counter of other programs: at least that of each release.
+const COUNTER: u32 = 9;
+
+impl Content {
+    /// The security counter of a sealed program.
+    #[must_use]
+    pub fn counter(self) -> u32 {
+        match self {
+            Self::Release(_, row) => RELEASES[usize::from(row)].1,
+            Self::Program(..) => COUNTER,
+            Self::Image(_) | Self::Noise(_) | Self::Free(_) => 0,
+        }
+    }
+
+    /// Whether it is something with this program number.
+    fn is_of(self, sub: u8) -> bool {
+        matches!(self, Self::Program(number, _) | Self::Release(number, _) if number == sub)
+    }
+
+    /// Whether it is a file that its owner has made.
+    fn is_made(self) -> bool {
+        !matches!(self, Self::Noise(_) | Self::Free(_))
+    }
+}
+
+/// Changes of bytes: at this place, modulo the length, to this value.
+pub type Changes = [(u16, u8); 3];
 
 /// What of it is one transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,6 +90,22 @@ pub enum Flaw {
     Product,
     /// Its end is missing: so many thousandths.
     Short(usize),
+    /// So many bytes after it.
+    Long(usize),
+    /// Another number of a block.
+    Number(u32),
+    /// In the last block, another CRC of the program.
+    Sum,
+    /// A device with keys gets it as if it had none.
+    Unsealed,
+    /// This chunk of a sealed image, modulo their number, is missing, or comes twice.
+    Chunk(usize, bool),
+    /// The chunks of this release.
+    Head(u8),
+    /// Signed by a stranger, with a certificate of his own.
+    Stranger,
+    /// Signed by the owner, with these changes in the manifest, or in the payload. It may be accepted.
+    Signed(Changes, bool),
 }
 
 /// A transfer.
@@ -91,10 +150,32 @@ pub struct File {
 /// The file with this content for a device.
 pub fn file(setup: &'static Setup, content: Content) -> Rc<File> {
     thread_local! {
-        static FILES: RefCell<HashMap<(&'static str, Content), Rc<File>>> = RefCell::default();
+        static FILES: RefCell<HashMap<(&'static str, bool, Content), Rc<File>>> = RefCell::default();
     }
     let make = || Rc::new(make(setup, content));
-    FILES.with(|files| files.borrow_mut().entry((setup.name, content)).or_insert_with(make).clone())
+    if matches!(content, Content::Free(_)) {
+        return make();
+    }
+    let key = (setup.name, setup.takes_sealed, content);
+    FILES.with(|files| files.borrow_mut().entry(key).or_insert_with(make).clone())
+}
+
+thread_local! {
+    static FREE: RefCell<Vec<Vec<u8>>> = RefCell::default();
+}
+
+/// Content of these bytes, until [`forget`].
+#[must_use]
+pub fn free(bytes: &[u8]) -> Content {
+    FREE.with_borrow_mut(|all| {
+        all.push(bytes.to_vec());
+        Content::Free(all.len() - 1)
+    })
+}
+
+/// Forgets the bytes of [`free`].
+pub fn forget() {
+    FREE.with_borrow_mut(Vec::clear);
 }
 
 impl Sent {
@@ -102,19 +183,25 @@ impl Sent {
     #[must_use]
     pub fn bytes(self, setup: &'static Setup) -> Vec<u8> {
         let file = file(setup, self.content);
+        let is_plain = !setup.takes_sealed || self.flaw == Flaw::Unsealed;
         let (mut bytes, is_block) = match (self.part, self.flaw) {
-            (Part::Block(block), _) => (file.blocks[block % file.blocks.len()].clone(), !setup.takes_sealed),
-            (Part::Hex, Flaw::Address(base)) if !setup.takes_sealed => return hex(base, &file.plain),
-            (Part::Hex, _) if !setup.takes_sealed => (hex(file.base, &file.plain), false),
+            (Part::Block(block), _) => (file.blocks[block % file.blocks.len()].clone(), file.blocks.len() > 1),
+            (Part::Hex, Flaw::Address(base)) if is_plain => return hex(base, &file.plain),
+            (Part::Hex, _) if is_plain => (hex(file.base, &file.plain), false),
+            (Part::Whole, Flaw::Unsealed) => (file.plain.clone(), false),
+            _ if setup.takes_sealed && self.content.is_made() => (self.sealed(setup, &file), false),
             _ => (file.whole.clone(), false),
         };
         let len = bytes.len();
+        let is_last = is_block && matches!(self.part, Part::Block(n) if (n + 1) % file.blocks.len() == 0);
         let product = || bytes.windows(4).position(|word| word == PRODUCT_CODE.to_le_bytes());
         let other_word = match self.flaw {
             // The header of a block has its address, and a program begins with its vector table.
             Flaw::Address(address) => Some((4, address)),
             // Of the control block, or of the label.
             Flaw::Product => product().map(|at| (at, !PRODUCT_CODE)),
+            Flaw::Number(number) if is_block => Some((0, number)),
+            Flaw::Sum if is_last => Some((16, !file.crc)),
             _ => None,
         };
         if let Some((at, word)) = other_word {
@@ -128,9 +215,55 @@ impl Sent {
             Flaw::Bit(n) => bytes[n % len] ^= 1 << (n / len % 8),
             Flaw::Crc => bytes[len - 1] ^= 1,
             Flaw::Short(thousandths) => bytes.truncate(len * (1000 - thousandths) / 1000),
+            Flaw::Long(more) => bytes.resize(len + more, 0x5A),
             _ => {}
         }
         bytes
+    }
+
+    /// A sealed image with a flaw of its own.
+    fn sealed(self, setup: &'static Setup, file: &File) -> Vec<u8> {
+        let parts = || Parts::of(&file.whole);
+        match self.flaw {
+            Flaw::Chunk(n, is_twice) => {
+                let Parts { manifest, chunks, .. } = parts();
+                let mut all: Vec<&[u8]> = chunks.chunks(32 + (1 << manifest[25])).collect();
+                let n = n % all.len();
+                if is_twice {
+                    all.insert(n, all[n]);
+                } else {
+                    all.remove(n);
+                }
+                Parts { chunks: all.concat(), ..parts() }.bytes()
+            }
+            Flaw::Head(row) => {
+                let program = if let Content::Release(program, _) = self.content { program } else { 1 };
+                let other = crate::files::file(setup, Content::Release(program, row));
+                Parts { chunks: Parts::of(&other.whole).chunks, ..parts() }.bytes()
+            }
+            Flaw::Stranger => {
+                let stranger = &keys().stranger;
+                let mut own = Certificate { key: stranger.public(), ..certificate() }.signed_by(stranger);
+                own[60..64].copy_from_slice(&keys().root.public().id().to_le_bytes());
+                parts().with(20, &500_u32.to_le_bytes()).certified(&own).signed_by(stranger).bytes()
+            }
+            Flaw::Signed(changes, in_payload) => {
+                let change = |bytes: &mut [u8]| {
+                    let len = bytes.len();
+                    changes.iter().for_each(|(at, value)| bytes[usize::from(*at) % len] = *value);
+                };
+                let mut parts = parts();
+                if in_payload {
+                    let mut payload = parts.payload();
+                    change(&mut payload);
+                    parts = parts.with_payload(&payload);
+                } else {
+                    change(&mut parts.manifest);
+                }
+                parts.signed()
+            }
+            _ => file.whole.clone(),
+        }
     }
 
     /// The CRC of the program that the transfer makes or completes, if it is accepted.
@@ -144,18 +277,30 @@ impl Sent {
         }
     }
 
+    /// Whether it completes a program, if it is accepted.
+    pub(crate) fn completes(self, setup: &'static Setup, sub: u8) -> bool {
+        let blocks = file(setup, self.content).blocks.len();
+        let is_last = |n: usize| (n + 1) % blocks == 0 && self.flaw != Flaw::Sum;
+        !matches!(self.part, Part::Block(n) if !is_last(n)) || setup.is_data(sub)
+    }
+
     /// Whether it is no block of several: its first bytes may be accepted, and the rest not.
     pub(crate) fn is_stream(self, setup: &Setup, sub: u8) -> bool {
-        !matches!(self.part, Part::Block(_)) || setup.takes_sealed || setup.is_data(sub)
+        !matches!(self.part, Part::Block(_)) || setup.is_data(sub)
     }
 
     /// Whether it has data that this program may have.
     pub(crate) fn fits(self, setup: &'static Setup, sub: u8) -> bool {
-        let is_its = matches!(self.content, Content::Program(number, _) if number == sub);
         let is_sound = || self.bytes(setup) == Self { flaw: Flaw::None, ..self }.bytes(setup);
         // Another address is in the first bytes; any other flaw may come after accepted ones.
-        let is_late = self.is_stream(setup, sub) && !matches!(self.flaw, Flaw::Address(_));
-        setup.is_data(sub) || is_its && (is_late || is_sound())
+        let is_first = matches!(self.flaw, Flaw::Address(_) | Flaw::Stranger) || self.is_unsealed(setup);
+        let is_late = self.is_stream(setup, sub) && !is_first;
+        setup.is_data(sub) && !setup.takes_sealed || self.content.is_of(sub) && (is_late || is_sound())
+    }
+
+    /// Whether a device with keys gets it as if it had none.
+    fn is_unsealed(self, setup: &Setup) -> bool {
+        setup.takes_sealed && self.flaw == Flaw::Unsealed
     }
 }
 
@@ -164,17 +309,8 @@ pub fn may_run(setup: &'static Setup, crc: u32) -> bool {
     (0..4).any(|number| file(setup, Content::Image(number)).crc == crc)
 }
 
-fn root() -> SigningKey {
-    SigningKey::from_seed([1; 32]).expect("its id is not 0")
-}
-
-/// The keys of a sealed device.
-pub fn keys() -> [u8; 256] {
-    key_block(&[root().public()], &[], 0, 0, false).expect("it has room for them")
-}
-
 fn make(setup: &Setup, content: Content) -> File {
-    let (number, base, chunk, counter, plain) = match content {
+    let (number, base, chunk, plain) = match content {
         Content::Image(which) => {
             let counter = 1 + u32::from(which);
             let board = if which == 5 { !BOARD } else { BOARD };
@@ -182,7 +318,7 @@ fn make(setup: &Setup, content: Content) -> File {
             let of = Header { counter, board, features, vendor: 0, product: 0, version: counter, ..SOUND };
             let mut image = image_of(of, 0x200 + 0x40 * usize::from(which % 4), which, true);
             image[0x100] ^= u8::from(which == 4);
-            (BOOTLOADER, HOME.base, 200, counter, image)
+            (BOOTLOADER, HOME.base, 200, image)
         }
         Content::Program(number, extent) => {
             let region = setup.region(number);
@@ -195,11 +331,27 @@ fn make(setup: &Setup, content: Content) -> File {
             };
             // Nearly all of the flash in few blocks.
             let chunk = if size > 0x800 { 1000 } else { 200 };
-            (number, region.base, chunk, 5, program(region, PRODUCT_CODE, size, number | fill))
+            (number, region.base, chunk, program(region, PRODUCT_CODE, size, number | fill))
+        }
+        Content::Release(number, row) => {
+            let region = setup.region(number);
+            let size = RELEASES[usize::from(row)].0;
+            (number, region.base, 96, program(region, PRODUCT_CODE, size, 16 * number | row))
+        }
+        Content::Free(which) => {
+            let bytes = FREE.with_borrow(|all| all[which].clone());
+            let (base, crc, size) = (setup.region(1).base, crc32(&bytes), bytes.len() as u32);
+            let blocks = vec![
+                block(0, 0, &words(&[size, VENDOR_ID, PRODUCT_CODE])),
+                block(1, base, &bytes),
+                block(u32::MAX, 0, &words(&[size, crc])),
+            ];
+            return File { plain: bytes.clone(), blocks, whole: bytes, base, crc };
         }
         Content::Noise(seed) => {
             let mut random = Random(seed);
-            let starts: [&[u8]; 5] = [b":020", &[0; 4], &[1, 0, 0, 0], &[0xC0, 0xFF, 0x01, 0x20], &[0xFF; 4]];
+            let starts: [&[u8]; 6] =
+                [b":020", b"CBS1", &[0; 4], &[1, 0, 0, 0], &[0xC0, 0xFF, 0x01, 0x20], &[0xFF; 4]];
             let mut bytes = random.pick(&starts).to_vec();
             bytes.extend((0..8 + random.below(300)).map(|_| random.below(256) as u8));
             // Of no form: it has neither heads nor a seal.
@@ -208,19 +360,39 @@ fn make(setup: &Setup, content: Content) -> File {
         }
     };
     let crc = if number == BOOTLOADER { crc_of(&plain) } else { crc32(&plain) };
-    if setup.takes_sealed {
-        let (vendor_id, product_code, program) = (VENDOR_ID, PRODUCT_CODE, number);
-        let sealer = Sealer { vendor_id, product_code, program, version: 1, counter, ..Sealer::default() };
-        let whole = sealer.seal(&plain, &root()).expect("it can be sealed");
-        return File { plain, blocks: vec![whole.clone()], whole, base, crc };
-    }
-    let size = plain.len() as u32;
+    let whole = if setup.takes_sealed { sealed(setup, number, content, &plain) } else { plain.clone() };
+    let (size, sum) = (whole.len() as u32, crc32(&whole));
     let is_told = !matches!(content, Content::Image(_) | Content::Program(_, Extent::Untold));
     let told = if is_told { size } else { 0 };
     let mut blocks = vec![block(0, 0, &words(&[told, VENDOR_ID, PRODUCT_CODE]))];
-    for (n, data) in (0..).zip(plain.chunks(chunk)) {
+    for (n, data) in (0..).zip(whole.chunks(chunk)) {
         blocks.push(block(1 + n, base + n * chunk as u32, data));
     }
-    blocks.push(block(u32::MAX, 0, &words(&[size, crc32(&plain)])));
-    File { whole: plain.clone(), plain, blocks, base, crc }
+    blocks.push(block(u32::MAX, 0, &words(&[size, sum])));
+    File { whole, plain, blocks, base, crc }
+}
+
+/// Signed by the release key, or by the root itself.
+fn sealed(setup: &Setup, program: u8, content: Content, plain: &[u8]) -> Vec<u8> {
+    let data = setup.is_data(program);
+    let made = match content {
+        Content::Release(_, row) => {
+            let (_, counter, form) = RELEASES[usize::from(row)];
+            let sealer = Sealer {
+                program,
+                counter,
+                version: u32::from(row) + 1,
+                chunk: 9 + row % 3,
+                data,
+                ..sealer(form)
+            };
+            sealer.seal(plain, &keys().release)
+        }
+        _ => {
+            let counter = if let Content::Image(which) = content { 1 + u32::from(which) } else { COUNTER };
+            Sealer { program, counter, data, certificate: None, ..sealer((false, false)) }
+                .seal(plain, &keys().root)
+        }
+    };
+    made.expect("it can be sealed")
 }

@@ -7,25 +7,28 @@ use canopen::AbortCode;
 use kit::model::caught;
 use shared_abi::renewal::Origin;
 
-use crate::device::{Action, Device, Stored, Trouble};
+use crate::device::{Action, Device, Program, Stored, Trouble};
 use crate::files::{file, Content, Extent, Part, NEWEST};
-use crate::rules::{History, RULES};
+use crate::rules::{broken, History};
 use crate::script;
 
 /// A broken rule, and what was found.
 #[derive(Clone, Debug)]
 pub struct Broken(pub &'static str, pub String);
 
-/// What attacks have met: the states of a renewal with the origin of the bootloader, and the lives of the device.
+/// What attacks have met: the states of a renewal with the origin of the bootloader, the lives of the device, and the
+/// programs that were installed.
 #[derive(Default)]
 pub struct Met {
+    pub programs: u64,
     pub states: BTreeSet<(u8, u8)>,
     pub lives: u64,
 }
 
-struct Attack<'a, D> {
-    device: D,
-    history: History,
+/// An attack on a device.
+pub struct Attack<'a, D> {
+    pub(crate) device: D,
+    pub(crate) history: History,
     met: &'a mut Met,
 }
 
@@ -42,9 +45,12 @@ impl<D: Device> Attack<'_, D> {
             Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
         })?;
         self.history.note(action, answer);
-        if let Some(rule) = RULES.iter().find(|rule| !(rule.is_kept)(&self.history, &seen)) {
+        if let Some(rule) = broken(&self.history, &seen) {
             return Err(Broken(rule.name, format!("before: {:X?}\n  now: {seen:X?}", self.history.seen)));
         }
+        let programs = self.history.seen.programs.iter().zip(&seen.programs);
+        let is_new = |(was, now): &(&Program, &Program)| was.stored != now.stored && now.record.is_some();
+        self.met.programs += programs.filter(is_new).count() as u64;
         self.met.lives += u64::from(seen.starts - self.history.seen.starts);
         self.met.states.insert((seen.state() as u8, seen.origin as u8));
         self.history.update(seen);
@@ -59,6 +65,9 @@ impl<D: Device> Attack<'_, D> {
     fn repair(&mut self) -> Result<(), Broken> {
         let setup = self.device.setup();
         self.act_all(&[Action::Flash(0, Trouble::None), Action::Cancel])?;
+        if self.history.is_spoilt {
+            return Ok(());
+        }
         if let Some(sub) = setup.profile.extras.bootloader {
             self.act_all(&script::make_room(setup))?;
             for _ in 0..8 {
@@ -111,13 +120,26 @@ impl<D: Device> Attack<'_, D> {
 ///
 /// # Errors
 /// The number of the action that broke a rule, or of all if the tool failed at the end; with the rule.
-pub fn play<D: Device>(mut device: D, actions: &[Action], met: &mut Met) -> Result<(), (usize, Broken)> {
+pub fn play<D: Device>(device: D, actions: &[Action], met: &mut Met) -> Result<(), (usize, Broken)> {
+    let mut attack = act(device, actions, met)?;
+    attack.repair().map_err(|broken| (actions.len(), broken))
+}
+
+/// Carries out actions on a new device.
+///
+/// # Errors
+/// The number of the action that broke a rule, with the rule.
+pub fn act<'m, D: Device>(
+    mut device: D,
+    actions: &[Action],
+    met: &'m mut Met,
+) -> Result<Attack<'m, D>, (usize, Broken)> {
     let history = History::new(device.setup(), device.look());
     let mut attack = Attack { device, history, met };
     for (n, action) in actions.iter().enumerate() {
         attack.act_all(&[*action]).map_err(|broken| (n, broken))?;
     }
-    attack.repair().map_err(|broken| (actions.len(), broken))
+    Ok(attack)
 }
 
 /// An attack that has broken a rule, with the actions that are needed for it.

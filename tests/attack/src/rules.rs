@@ -2,17 +2,20 @@
 
 use std::collections::BTreeSet;
 
+use boot_core::policy::Erase;
 use boot_core::store::NodeParameters;
 use canopen::{AbortCode, BitRate, NodeId};
 use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE, START};
-use kit::rig::Setup;
+use kit::rig::{crc32, Setup};
+use seal::access::right;
 use shared_abi::renewal::{Origin, State};
 use shared_abi::warm_start::BootRequest;
 
-use crate::device::{Action, Program, Seen, Stored};
-use crate::files::{may_run, Part};
+use crate::device::{Action, Holder, Partial, Program, Seen, Stored, Trouble};
+use crate::files::{file, may_run, Content, Flaw, Part, Sent};
 
 /// What was before an action, and the action with its answer.
+#[derive(Clone)]
 pub struct History {
     setup: &'static Setup,
     action: Action,
@@ -23,16 +26,31 @@ pub struct History {
     may_go: Vec<bool>,
     /// The image in staging has decayed since it was stored.
     rotten: bool,
-    /// The sub-index of the last transfer.
+    /// The sub-index of the last transfer, and whether it is one of all data.
     sub: u8,
+    is_stream: bool,
+    /// The sub-indices whose CLEAR was acknowledged: a second one erases.
+    cleared: BTreeSet<u8>,
+    /// The sub-indices whose password was given since the last reset.
+    unlocked: BTreeSet<u8>,
+    /// The sub-indices that may be released by what was done.
+    released: BTreeSet<u8>,
+    /// A root has permitted to erase since the last reset.
+    may_erase: bool,
+    /// The content that a begun download of a program may name in 2006h; `None` since something else came.
+    begun: Vec<(u8, Option<Content>)>,
+    /// The highest security counter of a program that is there and counts, by program.
+    proved: Vec<u32>,
+    /// An owner has signed what he should not have.
+    pub(crate) is_spoilt: bool,
     /// The sub-indices that an action has named since there was no work: these alone may change.
     named: BTreeSet<u8>,
     /// Those that were to be started since the last reset.
     asked: BTreeSet<u8>,
     /// START of it was acknowledged, and nothing else was asked.
     started: Option<u8>,
-    /// The programs that were sent, by number and CRC.
-    sent: Vec<(u8, u32)>,
+    /// The programs that were sent: by number, CRC, and security counter.
+    sent: Vec<(u8, u32, u32)>,
     /// The values that LSS may have stored: after a cut a record may read as it likes.
     nodes: Vec<NodeParameters>,
     /// The last of them was acknowledged.
@@ -48,6 +66,14 @@ impl History {
             may_go: vec![false; seen.programs.len()],
             rotten: false,
             sub: 1,
+            is_stream: false,
+            cleared: BTreeSet::new(),
+            unlocked: BTreeSet::new(),
+            released: BTreeSet::new(),
+            may_erase: false,
+            begun: Vec::new(),
+            proved: vec![0; seen.programs.len()],
+            is_spoilt: false,
             named: BTreeSet::new(),
             asked: BTreeSet::new(),
             started: None,
@@ -70,24 +96,46 @@ impl History {
                 if matches!(value, CLEAR | SET_SIGNATURE | CLR_SIGNATURE) {
                     self.named.insert(sub);
                 }
-                // In a sealed device genuine data alone end a program.
-                self.may_lose(sub, value == CLEAR && !setup.takes_sealed);
+                // CLEAR alone loses nothing; in a sealed device only with the right to erase.
+                let is_second = value == CLEAR && !self.cleared.insert(sub);
+                let erases = is_second || (setup.profile.download.erase)(sub) == Erase::AtOnce;
+                let may_erase = !setup.takes_sealed || self.may_erase;
+                self.may_lose(sub, value == CLEAR && erases && may_erase);
+                if value == SET_SIGNATURE {
+                    self.released.insert(sub);
+                }
                 // In CiA 302-3, 2 means reset, which starts the program for some profiles and after a stream.
                 if matches!(value, START | 2) {
                     self.asked.insert(sub);
                 }
                 self.started = (value == START && setup.has(sub)).then_some(sub);
             }
-            Action::Password { sub, .. } if is_taken && setup.password_clears() => {
-                self.named.insert(sub);
-                self.may_lose(sub, !setup.takes_sealed);
+            Action::Password { sub, .. } if is_taken => {
+                self.unlocked.insert(sub);
+                if setup.password_clears() {
+                    self.named.insert(sub);
+                    self.may_lose(sub, !setup.takes_sealed);
+                } else {
+                    self.unlocked.extend(1..=u8::MAX);
+                }
             }
+            Action::Right(_, right::ERASE) if is_taken => self.may_erase = true,
+            Action::Return(sub) => drop((self.named.insert(sub), self.released.insert(sub))),
+            Action::Flash(_, Trouble::Weak(_)) => self.begun.iter_mut().for_each(|(_, begun)| *begun = None),
             Action::Send { sub, sent, .. } => {
                 self.sub = sub;
-                self.sent.push((sub, sent.crc(setup, sub)));
+                self.is_spoilt |= matches!(sent.flaw, Flaw::Signed(..));
+                if sent.completes(setup, sub) {
+                    self.sent.push((sub, sent.crc(setup, sub), sent.content.counter()));
+                }
+                self.is_stream = sent.is_stream(setup, sub) || setup.takes_sealed;
+                self.begin(sub, sent);
                 // Of a stream the first part may have been accepted.
                 let is_accepted = sent.is_stream(setup, sub) || sent.part != Part::Block(0) && is_taken;
-                self.may_lose(sub, is_accepted && sent.fits(setup, sub));
+                // A counter is judged before anything is lost.
+                let proved = self.proved.get(usize::from(sub).wrapping_sub(1)).copied().unwrap_or(0);
+                let is_older = setup.takes_sealed && sent.content.counter() < proved;
+                self.may_lose(sub, is_accepted && sent.fits(setup, sub) && !is_older);
             }
             Action::Store(id) if is_taken => {
                 self.stores = true;
@@ -98,9 +146,20 @@ impl History {
         }
         if matches!(action, Action::Send { .. } | Action::GoOn(_)) {
             self.named.insert(self.sub);
+            self.released.extend(self.is_stream.then_some(self.sub));
             if is_taken && setup.profile.download.starts_by_itself {
                 self.asked.insert(self.sub);
             }
+        }
+    }
+
+    /// What 2006h may name: the content whose block 0 came, if no other content came for this program.
+    fn begin(&mut self, sub: u8, sent: Sent) {
+        let is_pure = matches!(sent.part, Part::Block(_)) && sent.flaw == Flaw::None && !self.setup.takes_sealed;
+        match self.begun.iter_mut().find(|(of, _)| *of == sub) {
+            Some((_, begun)) if is_pure && *begun == Some(sent.content) => {}
+            Some((_, begun)) => *begun = None,
+            None => self.begun.push((sub, is_pure.then_some(sent.content))),
         }
     }
 
@@ -114,17 +173,33 @@ impl History {
     pub(crate) fn update(&mut self, seen: Seen) {
         self.rotten &= seen.record.is_some();
         let is_reset = seen.starts != self.seen.starts;
+        let counters: Vec<_> =
+            (1..).zip(&seen.programs).map(|(number, program)| counter_of(self, number, program)).collect();
+        for ((proved, counter), program) in self.proved.iter_mut().zip(counters).zip(&seen.programs) {
+            let Some(record) = program.record.filter(|_| seen.is_certain) else { continue };
+            let counts = record.confirmed || !self.setup.config.download.seal.counter_with_confirmation;
+            if counts {
+                *proved = (*proved).max(counter);
+            }
+        }
         for ((may_go, now), before) in self.may_go.iter_mut().zip(&seen.programs).zip(&self.seen.programs) {
             // What was accepted belongs to a session; and a new program begins without.
             let is_over = is_reset || now.stored != before.stored;
             *may_go &= !(is_over && matches!(now.stored, Stored::Good(_)));
         }
+        let programs = (1..).zip(self.seen.programs.iter().zip(&seen.programs));
+        let is_new = |(_, (before, now)): &(u8, (&Program, &Program))| now.stored != before.stored;
+        let new: Vec<u8> = programs.filter(is_new).map(|(number, _)| number).collect();
+        self.cleared.retain(|number| !new.contains(number));
         if is_reset {
+            self.cleared.clear();
             self.asked.clear();
-            (self.started, self.stores) = (None, false);
+            self.unlocked.clear();
+            (self.started, self.stores, self.may_erase) = (None, false, false);
         }
         if seen.is_idle {
             self.named.clear();
+            self.released.clear();
             if self.stores && seen.is_stored {
                 self.nodes = vec![seen.node];
             }
@@ -154,7 +229,20 @@ pub const RULES: &[Rule] = &[
     Rule { name: "what starts is what was asked for", is_kept: starts_what_was_asked },
     Rule { name: "values and aborts are those of the standards", is_kept: has_defined_values },
     Rule { name: "without work no program is busy", is_kept: ends },
+    Rule { name: "what starts by itself is whole and released", is_kept: starts_the_whole },
+    Rule { name: "a program is released by 83h or by a transfer of all of it", is_kept: releases },
+    Rule { name: "without the password nothing is taken", is_kept: is_locked },
+    Rule { name: "data up to the address in 2006h are in flash", is_kept: goes_on },
+    Rule { name: "a sealed device has sealed programs alone", is_kept: is_sealed },
+    Rule { name: "no security counter decreases", is_kept: counts },
+    Rule { name: "no program is there before its security counter", is_kept: is_counted },
+    Rule { name: "no program follows a proved one with a higher counter", is_kept: follows },
 ];
+
+/// The first rule that is broken.
+pub fn broken(before: &History, now: &Seen) -> Option<&'static Rule> {
+    RULES.iter().find(|rule| !(rule.is_kept)(before, now))
+}
 
 /// Errors in 1F57h (SYS TEC manual L-1112d_10, table 3), and the three of sealed images (docs/protocol.md).
 #[rustfmt::skip]
@@ -207,7 +295,8 @@ fn tells_the_truth(before: &History, now: &Seen) -> bool {
         _ => None,
     };
     let is_sent = |(number, program): (u8, &Program)| {
-        program.record.is_none_or(|record| before.sent.contains(&(number, record.crc)))
+        let is = |sent: &(u8, u32, u32), crc| (sent.0, sent.1) == (number, crc);
+        program.record.is_none_or(|record| before.sent.iter().any(|sent| is(sent, record.crc)))
     };
     now.programs.iter().all(|program| program.is_true)
         && (1..).zip(&now.programs).all(is_sent)
@@ -253,7 +342,11 @@ fn starts_what_was_asked(before: &History, now: &Seen) -> bool {
 
 fn has_defined_values(before: &History, now: &Seen) -> bool {
     let has_password = |sub| before.setup.password(sub).is_some();
-    let is_wrong = matches!(before.action, Action::Password { sub, is_right: false } if has_password(sub));
+    let is_wrong = match before.action {
+        Action::Password { sub, is_right: false } => has_password(sub),
+        Action::Right(holder, _) => holder != Holder::Root,
+        _ => false,
+    };
     let is_defined = |program: &Program| {
         let Program { state, status, .. } = *program;
         let errors = if before.setup.takes_sealed { &ERRORS[..] } else { &ERRORS[..15] };
@@ -265,4 +358,64 @@ fn has_defined_values(before: &History, now: &Seen) -> bool {
 
 fn ends(_: &History, now: &Seen) -> bool {
     !now.is_idle || now.programs.iter().all(|program| program.status & 1 == 0)
+}
+
+fn starts_the_whole(_: &History, now: &Seen) -> bool {
+    now.starting.is_none_or(|(_, is_whole)| is_whole)
+}
+
+fn releases(before: &History, now: &Seen) -> bool {
+    let is_signed = |program: &Program| program.record.is_some_and(|record| record.signed);
+    let is_certain = before.seen.is_certain && now.is_certain;
+    let mut programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
+    let may_be = |number| before.released.contains(&number) || before.asked.contains(&number);
+    !is_certain || programs.all(|(number, (was, now))| !is_signed(now) || is_signed(was) || may_be(number))
+}
+
+fn is_locked(before: &History, _: &Seen) -> bool {
+    let Action::Send { sub, .. } = before.action else { return true };
+    before.answer.is_err() || !before.setup.profile.download.locked || before.unlocked.contains(&sub)
+}
+
+fn goes_on(before: &History, now: &Seen) -> bool {
+    (1..).zip(&now.programs).all(|(number, program)| {
+        let Some(Partial { id, len, crc }) = program.partial else { return true };
+        let begun = before.begun.iter().find(|(of, _)| *of == number).and_then(|(_, begun)| *begun);
+        let Some(content) = begun else { return true };
+        let file = file(before.setup, content);
+        let control = &file.blocks[0];
+        let is_its = control[control.len() - 4..] == id.to_le_bytes();
+        !is_its || file.plain.get(..len).is_some_and(|done| crc32(done) == crc)
+    })
+}
+
+fn is_sealed(before: &History, now: &Seen) -> bool {
+    let is_sealed = |program: &Program| program.record.is_none_or(|record| record.is_sealed());
+    !before.setup.takes_sealed || now.programs.iter().all(is_sealed)
+}
+
+fn counts(before: &History, now: &Seen) -> bool {
+    let is_certain = before.seen.is_certain && now.is_certain;
+    !is_certain || before.seen.programs.iter().zip(&now.programs).all(|(was, now)| now.counter >= was.counter)
+}
+
+/// The lowest security counter of the program that is there, by its CRC; 0 for none.
+fn counter_of(before: &History, number: u8, program: &Program) -> u32 {
+    let Some(record) = program.record.filter(|_| before.setup.takes_sealed) else { return 0 };
+    let sent = before.sent.iter().filter(|(of, crc, _)| (*of, *crc) == (number, record.crc));
+    sent.map(|(.., counter)| *counter).min().unwrap_or(0)
+}
+
+fn is_counted(before: &History, now: &Seen) -> bool {
+    before.setup.config.download.seal.counter_with_confirmation
+        || (1..).zip(&now.programs).all(|(number, program)| program.counter >= counter_of(before, number, program))
+}
+
+fn follows(before: &History, now: &Seen) -> bool {
+    let is_certain = before.seen.is_certain && now.is_certain;
+    let programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
+    !is_certain
+        || programs.zip(&before.proved).all(|((number, (was, now)), proved)| {
+            was.stored == now.stored || now.record.is_none() || counter_of(before, number, now) >= *proved
+        })
 }

@@ -5,10 +5,11 @@ use kit::bench::{CLEAR, SET_SIGNATURE as CONFIRM, START};
 use kit::model::Cut;
 use kit::random::Random;
 use kit::rig::{crc32, Setup};
+use seal::access::right;
 use shared_abi::renewal::{Origin, State};
 
-use crate::device::{Action, Seen, Trouble};
-use crate::files::{file, Content, Extent, Flaw, Part, Sent};
+use crate::device::{Action, Holder, Seen, Trouble};
+use crate::files::{file, free, Changes, Content, Extent, Flaw, Part, Sent, RELEASES};
 
 /// Commands of 1F51h.
 const COMMANDS: [u8; 9] = [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, 0x84];
@@ -18,11 +19,62 @@ const EXTENTS: [Extent; 4] = [Extent::Small, Extent::Small, Extent::Large, Exten
 const INDICES: [u16; 9] = [0x1000, 0x1001, 0x1008, 0x100A, 0x1018, 0x1F51, 0x1F56, 0x1F57, 0x1F50];
 
 /// The kinds of actions. The last two, which a renewal needs, are in each attack.
-const KINDS: usize = 19;
+const KINDS: usize = 22;
 
-struct Script {
+/// What draws.
+enum Source<'a> {
+    Seed(Random),
+    /// The bytes of a fuzzer, and zeros after them.
+    Bytes(&'a [u8]),
+}
+
+impl Source<'_> {
+    fn bytes(&mut self, count: usize) -> u64 {
+        let Self::Bytes(bytes) = self else { unreachable!("a seed has no end") };
+        let (first, rest) = bytes.split_at(count.min(bytes.len()));
+        *bytes = rest;
+        first.iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
+    }
+
+    fn next(&mut self) -> u64 {
+        match self {
+            Self::Seed(random) => random.next(),
+            Self::Bytes(_) => self.bytes(4),
+        }
+    }
+
+    fn below(&mut self, end: usize) -> usize {
+        match self {
+            Self::Seed(random) => random.below(end),
+            Self::Bytes(_) => self.bytes(if end > 256 { 2 } else { 1 }) as usize % end,
+        }
+    }
+
+    fn chance(&mut self, percent: usize) -> bool {
+        self.below(100) < percent
+    }
+
+    fn pick<T: Copy>(&mut self, among: &[T]) -> T {
+        among[self.below(among.len())]
+    }
+
+    fn noise(&mut self) -> Content {
+        match self {
+            Self::Seed(random) => Content::Noise(random.next()),
+            Self::Bytes(_) => {
+                let size = self.below(256);
+                let Self::Bytes(bytes) = self else { unreachable!() };
+                let (first, rest) = bytes.split_at(size.min(bytes.len()));
+                *bytes = rest;
+                free(first)
+            }
+        }
+    }
+}
+
+struct Script<'a> {
     setup: &'static Setup,
-    random: Random,
+    random: Source<'a>,
     actions: Vec<Action>,
     /// A reset may have come since the last password.
     is_locked: bool,
@@ -35,8 +87,9 @@ pub fn of(setup: &'static Setup, seed: u64) -> Vec<Action> {
     // Of the other kinds some alone: what one needs, another one always undoes.
     let mut kinds: Vec<usize> = (0..KINDS - 2).filter(|_| random.chance(40)).collect();
     kinds.extend([KINDS - 2, KINDS - 1, KINDS - 1]);
-    let mut script = Script { setup, random, actions: Vec::new(), is_locked: true };
-    for _ in 0..script.random.below(60) {
+    let count = random.below(60);
+    let mut script = Script { setup, random: Source::Seed(random), actions: Vec::new(), is_locked: true };
+    for _ in 0..count {
         let kind = script.random.pick(&kinds);
         script.draw(kind);
         script.run();
@@ -44,7 +97,18 @@ pub fn of(setup: &'static Setup, seed: u64) -> Vec<Action> {
     script.actions
 }
 
-impl Script {
+/// The actions of the bytes of a fuzzer.
+pub fn of_bytes(setup: &'static Setup, bytes: &[u8]) -> Vec<Action> {
+    let mut script = Script { setup, random: Source::Bytes(bytes), actions: Vec::new(), is_locked: true };
+    while !matches!(script.random, Source::Bytes([])) {
+        let kind = script.random.below(KINDS);
+        script.draw(kind);
+        script.run();
+    }
+    script.actions
+}
+
+impl Script<'_> {
     fn draw(&mut self, kind: usize) {
         let random = &mut self.random;
         let program = 1 + random.below(self.setup.programs().into()) as u8;
@@ -53,7 +117,11 @@ impl Script {
         let bytes = Extent::Bytes(least + 4 * random.below(40));
         let extent = if random.chance(50) { random.pick(&EXTENTS) } else { bytes };
         let place = if random.chance(5) { 1 } else { program };
-        let of_program = Content::Program(place, extent);
+        let row = random.below(RELEASES.len()) as u8;
+        // Each program that is sealed otherwise has the highest counter.
+        let is_release = random.chance(if self.setup.takes_sealed { 80 } else { 10 });
+        let of_program =
+            if is_release { Content::Release(place, row) } else { Content::Program(place, extent) };
         let renews = self.setup.profile.extras.bootloader;
         let own = renews.unwrap_or(program);
         // Without a renewal there are programs alone.
@@ -75,7 +143,8 @@ impl Script {
             5 | 6 => self.download(program, of_program),
             7 => {
                 // Of one of two masters, which may not end it.
-                let content = random.pick(&[of_program, of_program, image, Content::Noise(seed)]);
+                let noise = random.noise();
+                let content = random.pick(&[of_program, of_program, image, noise]);
                 let block = random.below(3);
                 let part = random.pick(&[Part::Block(block), Part::Whole, Part::Hex]);
                 let bytes = random.chance(60).then(|| random.below(1500));
@@ -93,8 +162,15 @@ impl Script {
             15 => self.reset(Action::Rot(seed as usize, (seed >> 32) as u8)),
             16 if seed.is_multiple_of(3) => self.actions.push(Action::Upload { sub: program }),
             16 => self.actions.push(Action::Read { index: random.pick(&INDICES), sub: any - 1 }),
-            17 => self.go_on(),
-            18 if renews.is_some() => {
+            17 => self.reset(Action::Crash),
+            18 if self.setup.takes_sealed => {
+                let holder = random.pick(&[Holder::Root, Holder::Root, Holder::Release, Holder::Stranger]);
+                let rights = [right::ERASE, right::CLEAR_SIGNATURE, right::STORE, right::READ_BACK];
+                self.actions.push(Action::Right(holder, random.pick(&rights)));
+            }
+            18 | 19 => self.actions.extend([Action::Settle, Action::Return(program)]),
+            20 => self.go_on(),
+            21 if renews.is_some() => {
                 let image = if seed.is_multiple_of(4) { image } else { Content::Image(1) };
                 self.actions.extend(self.is_locked.then_some(Action::Password { sub: own, is_right: true }));
                 if self.random.chance(40) {
@@ -127,12 +203,27 @@ impl Script {
         let region = random.pick(layout.programs);
         let ends = [region.base, region.base - 4, region.end() - 8, region.end(), 0xFFFF_FFF0];
         let addresses = [&ends[..], &[layout.bootloader.base, layout.parameters[0].base]].concat();
-        match random.below(6) {
-            _ if !random.chance(percent) => Flaw::None,
+        if !random.chance(percent) {
+            return Flaw::None;
+        }
+        let mut changes: Changes = [(0, 0); 3];
+        let count = if self.setup.takes_sealed { 14 } else { 9 };
+        match random.below(count) {
             0 => Flaw::Bit(random.below(20_000)),
             1 => Flaw::Crc,
             2 => Flaw::Address(random.pick(&addresses)),
             3 => Flaw::Product,
+            4 => Flaw::Long(1 + random.below(600)),
+            5 => Flaw::Number(random.pick(&[0, 1, 2, 5, u32::MAX])),
+            6 => Flaw::Sum,
+            9 => Flaw::Unsealed,
+            10 => Flaw::Chunk(random.below(8), random.chance(50)),
+            11 => Flaw::Head(random.below(RELEASES.len()) as u8),
+            12 => Flaw::Stranger,
+            13 => {
+                changes.fill_with(|| (random.below(2000) as u16, random.below(256) as u8));
+                Flaw::Signed(changes, random.chance(50))
+            }
             _ => Flaw::Short(1 + random.below(999)),
         }
     }
@@ -200,11 +291,11 @@ impl Script {
 }
 
 /// The whole download of a tool.
-fn whole(setup: &'static Setup, sub: u8, content: Content) -> Vec<Action> {
+pub(crate) fn whole(setup: &'static Setup, sub: u8, content: Content) -> Vec<Action> {
     let mut actions = vec![Action::Settle, Action::Command { sub, value: CLEAR }];
-    for block in 0..file(setup, content).blocks.len() {
-        actions.extend([Action::Settle, Action::send(sub, content, Part::Block(block))]);
-    }
+    let blocks = if setup.takes_sealed { 0 } else { file(setup, content).blocks.len() };
+    let parts = (0..blocks).map(Part::Block).chain(setup.takes_sealed.then_some(Part::Whole));
+    actions.extend(parts.flat_map(|part| [Action::Settle, Action::send(sub, content, part)]));
     actions.push(Action::Settle);
     actions
 }

@@ -1,8 +1,8 @@
 //! The random lives of devices of each product, with and without a renewal of the bootloader:
 //!
 //! ```sh
-//! COBOOT_ATTACKS=2000 cargo test -p coboot-attack    # seeds for each product
-//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-attack    # one, with its actions
+//! COBOOT_ATTACKS=2000 cargo test -p coboot-attack --test lives    # seeds for each product
+//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-attack --test lives    # one, with its actions
 //! ```
 
 use attack::device::{Action, Trouble};
@@ -11,7 +11,7 @@ use attack::model::Model;
 use attack::play::{attack, play, Failure, Met};
 use attack::script;
 use kit::rig::{
-    Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LARGE_JOURNAL, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS,
+    sealed, Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LARGE_JOURNAL, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS,
     STANDARD_1, STANDARD_2,
 };
 
@@ -63,6 +63,14 @@ fn no_action_breaks_a_rule_of_other_devices() {
     attacks(of_one.into_iter().chain(of_two), 100, &[(256, 0), (1024, 0)]);
     // From 64 of its 585 places on the journal is compacted when the device is idle, and soon from 256 on.
     attacks([&LARGE_JOURNAL], 40, &[50, 240, 560].map(|stores| (2048, stores)));
+}
+
+#[test]
+fn whatever_is_done_what_starts_is_authentic() {
+    let of_two = [&sealed::STANDARD_2, &sealed::CONFIRMED_2, &sealed::ESACADEMY_2, &sealed::LIFT_2];
+    let met = attacks([&sealed::STANDARD_1].into_iter().chain(of_two), 100, &[(2048, 0)]);
+    // The attack is on a working device.
+    assert!(environment("COBOOT_ATTACK_SEED").is_some() || met.programs > 300, "{}", met.programs);
 }
 
 /// On a device that takes a download without CLEAR a session outlives what it has relied on when it began: an

@@ -19,9 +19,8 @@
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
 //!
-//! The attackers below the bus are in `core/boot-core/tests`: `attacker.rs` drives the object dictionary
-//! on the strict flash model, with faults of the flash, and `masters.rs` the slave; sealed devices
-//! have `tests/sealed/attacker.rs`.
+//! The attack below the bus is `tests/attack`, with faults of the flash and sealed images; `masters.rs` in
+//! `core/boot-core/tests` attacks the slave.
 
 pub mod board;
 mod broken;

@@ -1,30 +1,10 @@
 //! `cargo xtask powercut`: cuts the power at every flash operation, and checks the device after the
 //! power returns.
 
-use std::fmt::Display;
 use std::process::ExitCode;
-use std::str::FromStr;
 
-use coboot_tests::powercut::board::{self, Effort};
-use coboot_tests::powercut::{reproduce, run, Cuts, Point, Report, SCENARIOS};
-
-/// A point of one of the levels.
-enum AnyPoint {
-    Model(Point),
-    Board(board::Point),
-}
-
-impl FromStr for AnyPoint {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        if text.split(':').next() == Some(board::NAME) {
-            text.parse().map(Self::Board)
-        } else {
-            text.parse().map(Self::Model)
-        }
-    }
-}
+use attack::cuts::{self, Cuts, Point, Report};
+use coboot_tests::powercut::{self, Effort};
 
 /// What to do.
 #[derive(Default)]
@@ -40,7 +20,7 @@ struct Wish {
     twentieth: bool,
     /// This scenario alone.
     scenario: Option<String>,
-    point: Option<AnyPoint>,
+    point: Option<Point>,
 }
 
 impl Wish {
@@ -59,10 +39,11 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             "--evidence" => wish.evidence = Some(arguments.next().ok_or("--evidence wants a file.")?),
             "--twentieth" => wish.twentieth = true,
             "--scenario" => wish.scenario = Some(arguments.next().ok_or("--scenario wants a name.")?),
-            "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
-                Some(point) => wish.point = Some(point?),
-                None => return Err("--reproduce wants a point, as update:37:torn.".into()),
-            },
+            "--reproduce" => {
+                let text = arguments.next().ok_or("--reproduce wants a point, as update:37:torn.")?;
+                let boards: Vec<_> = powercut::scenarios().map(|scenario| scenario.name).collect();
+                wish.point = Some(Point::parse(&text, &boards)?);
+            }
             other => {
                 return Err(format!(
                     "{other:?} is no option; there are --full, --every-way, --twentieth, --scenario NAME, --json, --evidence FILE and --reproduce POINT."
@@ -83,7 +64,7 @@ struct Sum {
 }
 
 impl Sum {
-    fn add<P: Display>(&mut self, level: u8, name: &str, report: &Report<P>, json: bool) {
+    fn add(&mut self, level: u8, name: &str, report: &Report, json: bool) {
         self.points += report.points;
         self.states += report.states;
         self.violations += report.violations;
@@ -99,16 +80,9 @@ fn main() -> ExitCode {
         Ok(wish) => wish,
         Err(why) => return refuse(&why),
     };
-    match wish.point {
-        Some(AnyPoint::Model(point)) => {
-            print!("{}", reproduce(&point));
-            return ExitCode::SUCCESS;
-        }
-        Some(AnyPoint::Board(point)) => {
-            print!("{}", board::reproduce(point));
-            return ExitCode::SUCCESS;
-        }
-        None => {}
+    if let Some(point) = wish.point {
+        print!("{}", if point.is_board { powercut::reproduce(point) } else { cuts::reproduce(&point) });
+        return ExitCode::SUCCESS;
     }
     let mut sum = Sum::default();
     let head =
@@ -118,8 +92,8 @@ fn main() -> ExitCode {
             println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
         }
         let cuts = if wish.every_way { Cuts::EveryWay } else { Cuts::EveryOperation };
-        for scenario in SCENARIOS.iter().filter(|scenario| wish.has(scenario.name)) {
-            match run(scenario, cuts) {
+        for scenario in cuts::SCENARIOS.iter().filter(|scenario| wish.has(scenario.name)) {
+            match cuts::run(scenario, cuts) {
                 Ok(report) => sum.add(1, scenario.name, &report, wish.json),
                 Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
             }
@@ -131,7 +105,7 @@ fn main() -> ExitCode {
             coboot_tests::firmware::board().board
         );
     }
-    for scenario in board::scenarios().filter(|scenario| wish.has(scenario.name)) {
+    for scenario in powercut::scenarios().filter(|scenario| wish.has(scenario.name)) {
         // Every operation once; the other scenarios share most of those of an update.
         let has_its_own = matches!(scenario.name, "update" | "renewal");
         let effort = match (wish.full && has_its_own, wish.full || wish.twentieth) {
@@ -139,7 +113,7 @@ fn main() -> ExitCode {
             (_, true) => Effort::TWENTIETH,
             _ => Effort::SAMPLE,
         };
-        match board::run(scenario, effort) {
+        match powercut::run(scenario, effort) {
             Ok(report) => sum.add(2, scenario.name, &report, wish.json),
             Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
         }
@@ -176,11 +150,11 @@ fn refuse(why: &str) -> ExitCode {
     ExitCode::FAILURE
 }
 
-fn outcomes<P>(report: &Report<P>) -> [u64; 3] {
+fn outcomes(report: &Report) -> [u64; 3] {
     ["bootloader", "old program", "new program"].map(|what| report.outcomes.get(what).copied().unwrap_or(0))
 }
 
-fn as_text<P: Display>(name: &str, report: &Report<P>) -> String {
+fn as_text(name: &str, report: &Report) -> String {
     let [bootloader, old, new] = outcomes(report);
     let mut text = format!(
         "{name:<18} {:>10} {:>9} {:>8} {:>11} {bootloader:>12} {old:>12} {new:>12} {:>11}",
@@ -192,7 +166,7 @@ fn as_text<P: Display>(name: &str, report: &Report<P>) -> String {
     text
 }
 
-fn as_json<P: Display>(level: u8, name: &str, report: &Report<P>) -> String {
+fn as_json(level: u8, name: &str, report: &Report) -> String {
     let [bootloader, old, new] = outcomes(report);
     let told: Vec<_> =
         report.told.iter().map(|(point, what)| format!("{:?}", format!("{point}: {what}"))).collect();
