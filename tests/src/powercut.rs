@@ -34,13 +34,8 @@ pub mod story;
 const LOOKS: usize = 3;
 
 /// The ways in which an operation is cut, in the order of their names.
-const WAYS: [Cut; 5] = [
-    Cut::Before,
-    Cut::After,
-    Cut::Torn { seed: 7 },
-    Cut::Torn { seed: 8 },
-    Cut::Unstable { seed: 9 },
-];
+const WAYS: [Cut; 5] =
+    [Cut::Before, Cut::After, Cut::Torn { seed: 7 }, Cut::Torn { seed: 8 }, Cut::Unstable { seed: 9 }];
 
 /// The operations that are taken: so many at the beginning and at the end, and one of how many
 /// between.

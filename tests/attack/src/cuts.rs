@@ -10,7 +10,9 @@ use canopen::NodeId;
 use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE};
 use kit::model::{caught, Cut, ModelFlash};
 use kit::random::Random;
-use kit::rig::{fill_journal, sealed as with_keys, Setup, BOARD_NODE, ESACADEMY_2, LIFT_2, RENEWALS, STANDARD_2};
+use kit::rig::{
+    fill_journal, sealed as with_keys, Setup, BOARD_NODE, ESACADEMY_2, LIFT_2, RENEWALS, STANDARD_2,
+};
 use seal::access::right;
 use shared_abi::geometry::Region;
 
@@ -77,8 +79,7 @@ impl Point {
     pub fn parse(text: &str, boards: &[&'static str]) -> Result<Self, String> {
         let of_board = text.strip_prefix("board:");
         let models: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
-        let (names, ways) =
-            if of_board.is_some() { (boards, &WAYS[..5]) } else { (&models[..], &WAYS[..]) };
+        let (names, ways) = if of_board.is_some() { (boards, &WAYS[..5]) } else { (&models[..], &WAYS[..]) };
         let mut words = of_board.unwrap_or(text).split(':');
         let name = words.next().unwrap_or_default();
         let unknown = || format!("{name:?} is no scenario; there are {}.", names.join(", "));
@@ -180,7 +181,8 @@ pub struct Scenario {
     act: Actions,
     /// What a device must refuse after a cut, whatever it has.
     refused: Actions,
-    recover: Actions,
+    /// `None`: the same once more.
+    recover: Option<Actions>,
     /// The recovery is cut at one of so many operations.
     one_in: u32,
     end: End,
@@ -238,7 +240,10 @@ fn flawed(setup: &'static Setup, block: usize, flaw: Flaw) -> Vec<Action> {
 
 /// The blocks of the new program without CLEAR.
 fn without_clear(setup: &'static Setup) -> Vec<Action> {
-    install(setup, 1, NEW).into_iter().filter(|action| !matches!(action, Action::Command { value: CLEAR, .. })).collect()
+    install(setup, 1, NEW)
+        .into_iter()
+        .filter(|action| !matches!(action, Action::Command { value: CLEAR, .. }))
+        .collect()
 }
 
 /// The beginning of a program, some steps of work, and then the client is gone.
@@ -293,7 +298,7 @@ const UPDATE: Scenario = Scenario {
     before: |setup| install(setup, 1, OLD),
     act: |setup| install(setup, 1, NEW),
     refused: |_| vec![],
-    recover: |setup| install(setup, 1, NEW),
+    recover: None,
     one_in: 1,
     end: End(Some(NEW), None, true, &[]),
 };
@@ -304,7 +309,6 @@ const SEALED: Scenario = Scenario {
     setup: &with_keys::STANDARD_1,
     before: |setup| sealed(setup, 2),
     act: |setup| sealed(setup, 5),
-    recover: |setup| sealed(setup, 5),
     one_in: 200,
     end: End(release(5), None, true, &[]),
     ..UPDATE
@@ -325,14 +329,12 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "raw",
         about: "another program as a raw image, which is valid without a signature command",
         act: |setup| at_once(setup, 1, NEW, Part::Whole),
-        recover: |setup| at_once(setup, 1, NEW, Part::Whole),
         ..UPDATE
     },
     Scenario {
         name: "hex",
         about: "another program as Intel HEX",
         act: |setup| at_once(setup, 1, NEW, Part::Hex),
-        recover: |setup| at_once(setup, 1, NEW, Part::Hex),
         ..UPDATE
     },
     Scenario {
@@ -343,19 +345,20 @@ pub static SCENARIOS: &[Scenario] = &[
             let wrong = [flawed(setup, last, Flaw::Sum), command(1, SET_SIGNATURE).to_vec()];
             [wrong.concat(), install(setup, 1, NEW)].concat()
         },
+        recover: Some(|setup| install(setup, 1, NEW)),
         ..UPDATE
     },
     Scenario {
         name: "wrong-product",
         about: "an update for another product, which costs nothing",
         act: |setup| flawed(setup, 0, Flaw::Product),
+        recover: Some(|setup| install(setup, 1, NEW)),
         ..UPDATE
     },
     Scenario {
         name: "erase",
         about: "a program taken away by two CLEARs",
         act: |_| [command(1, CLEAR), command(1, CLEAR)].concat(),
-        recover: |_| [command(1, CLEAR), command(1, CLEAR)].concat(),
         end: End(None, None, false, &[]),
         ..UPDATE
     },
@@ -366,10 +369,6 @@ pub static SCENARIOS: &[Scenario] = &[
             let erase = [command(1, CLEAR), command(1, CLEAR)].concat();
             [erase, vec![Action::ResetNode], without_clear(setup)].concat()
         },
-        recover: |setup| {
-            let erase = [command(1, CLEAR), command(1, CLEAR)].concat();
-            [erase, vec![Action::ResetNode], without_clear(setup)].concat()
-        },
         ..UPDATE
     },
     Scenario {
@@ -377,7 +376,6 @@ pub static SCENARIOS: &[Scenario] = &[
         about: "a signature set",
         before: |setup| whole(setup, 1, OLD),
         act: |_| command(1, SET_SIGNATURE).to_vec(),
-        recover: |_| command(1, SET_SIGNATURE).to_vec(),
         end: End(Some(OLD), None, true, &[]),
         ..UPDATE
     },
@@ -385,7 +383,6 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "unsign",
         about: "a signature taken away",
         act: |_| command(1, CLR_SIGNATURE).to_vec(),
-        recover: |_| command(1, CLR_SIGNATURE).to_vec(),
         end: End(Some(OLD), None, false, &[]),
         ..UPDATE
     },
@@ -393,7 +390,6 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "lss-store",
         about: "node-ID and bit rate stored by layer setting services",
         act: |_| vec![Action::Store(9), Action::Settle],
-        recover: |_| vec![Action::Store(9), Action::Settle],
         end: End(Some(OLD), None, true, &[9]),
         ..UPDATE
     },
@@ -401,7 +397,7 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "compaction",
         about: "so many stores of node-ID and bit rate that the journal changes over twice",
         act: |_| (1..=50).flat_map(|id| [Action::Store(id), Action::Settle]).collect(),
-        recover: |_| vec![Action::Store(100), Action::Settle],
+        recover: Some(|_| vec![Action::Store(100), Action::Settle]),
         end: End(Some(OLD), None, true, &[50, 100]),
         ..UPDATE
     },
@@ -409,7 +405,7 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "crash-count",
         about: "crashes are counted, and a reset clears the count",
         act: |_| vec![Action::Crash, Action::Crash, Action::ResetNode],
-        recover: |_| vec![Action::Crash, Action::ResetNode],
+        recover: Some(|_| vec![Action::Crash, Action::ResetNode]),
         end: End(Some(OLD), None, true, &[]),
         ..UPDATE
     },
@@ -419,7 +415,6 @@ pub static SCENARIOS: &[Scenario] = &[
         setup: &LIFT_2,
         before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
         act: |setup| at_once(setup, 2, NEW_2, Part::Whole),
-        recover: |setup| at_once(setup, 2, NEW_2, Part::Whole),
         end: End(Some(OLD_LABELLED), Some(NEW_2), true, &[]),
         ..UPDATE
     },
@@ -428,7 +423,6 @@ pub static SCENARIOS: &[Scenario] = &[
         about: "program 2 updated while program 1 stays what it is",
         before: |setup| [install(setup, 1, OLD), install(setup, 2, OLD_2)].concat(),
         act: |setup| install(setup, 2, NEW_2),
-        recover: |setup| install(setup, 2, NEW_2),
         end: End(Some(OLD), Some(NEW_2), true, &[]),
         ..UPDATE
     },
@@ -445,7 +439,7 @@ pub static SCENARIOS: &[Scenario] = &[
         setup: &LIFT_2,
         before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
         act: password_during,
-        recover: |setup| both(setup, [NEW_LABELLED, NEW_2]),
+        recover: Some(|setup| both(setup, [NEW_LABELLED, NEW_2])),
         one_in: 8,
         end: End(Some(NEW_LABELLED), Some(NEW_2), true, &[]),
         ..UPDATE
@@ -456,7 +450,7 @@ pub static SCENARIOS: &[Scenario] = &[
         setup: &ESACADEMY_2,
         before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
         act: password_during,
-        recover: |setup| both(setup, [NEW_LABELLED, NEW_2]),
+        recover: Some(|setup| both(setup, [NEW_LABELLED, NEW_2])),
         one_in: 8,
         end: End(Some(NEW_LABELLED), Some(NEW_2), true, &[]),
         ..UPDATE
@@ -466,7 +460,6 @@ pub static SCENARIOS: &[Scenario] = &[
         about: "the bootloader is renewed; a program is there before and afterwards",
         setup: &RENEWALS[0],
         act: renew,
-        recover: renew,
         one_in: 1000,
         end: End(Some(OLD), None, true, &[]),
         ..UPDATE
@@ -476,7 +469,6 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "compressed",
         about: "the same, encrypted and compressed",
         act: |setup| sealed(setup, 4),
-        recover: |setup| sealed(setup, 4),
         end: End(release(4), None, true, &[]),
         ..SEALED
     },
@@ -501,7 +493,6 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "proved-erase",
         about: "a sealed program that has proved itself, taken away by the holder of a root",
         act: erase_sealed,
-        recover: erase_sealed,
         end: End(None, None, false, &[]),
         ..CONFIRMED
     },
@@ -509,7 +500,6 @@ pub static SCENARIOS: &[Scenario] = &[
         name: "proved-again",
         about: "the same, and the other one proves itself, too",
         act: |setup| proved(setup, 5),
-        recover: |setup| proved(setup, 5),
         ..CONFIRMED
     },
 ];
@@ -678,9 +668,9 @@ impl Proof<'_> {
 
     /// What the host does after a cut.
     fn recover(&self, from: &State) -> Result<Trace, String> {
-        let Scenario { setup, refused, recover, .. } = *self.scenario;
+        let Scenario { setup, refused, act, recover, .. } = *self.scenario;
         self.play(&from.flash, &from.history, &refused(setup))?;
-        let (_, trace) = self.play(&from.flash, &from.history, &recover(setup))?;
+        let (_, trace) = self.play(&from.flash, &from.history, &recover.unwrap_or(act)(setup))?;
         match self.ends(&trace.history.seen) {
             true => Ok(trace),
             false => {
@@ -704,7 +694,11 @@ impl Proof<'_> {
             }
         };
         let is_node = |id: Option<NodeId>| {
-            if nodes.is_empty() { id == BOARD_NODE.id } else { id.is_some_and(|id| nodes.contains(&id.get())) }
+            if nodes.is_empty() {
+                id == BOARD_NODE.id
+            } else {
+                id.is_some_and(|id| nodes.contains(&id.get()))
+            }
         };
         let renews = setup.profile.extras.bootloader.is_some();
         let is_signed = |program: &Program| program.record.is_none_or(|record| record.signed);

@@ -185,7 +185,9 @@ impl Sent {
         let file = file(setup, self.content);
         let is_plain = !setup.takes_sealed || self.flaw == Flaw::Unsealed;
         let (mut bytes, is_block) = match (self.part, self.flaw) {
-            (Part::Block(block), _) => (file.blocks[block % file.blocks.len()].clone(), file.blocks.len() > 1),
+            (Part::Block(block), _) => {
+                (file.blocks[block % file.blocks.len()].clone(), file.blocks.len() > 1)
+            }
             (Part::Hex, Flaw::Address(base)) if is_plain => return hex(base, &file.plain),
             (Part::Hex, _) if is_plain => (hex(file.base, &file.plain), false),
             (Part::Whole, Flaw::Unsealed) => (file.plain.clone(), false),
@@ -291,7 +293,9 @@ impl Sent {
 
     /// Whether it has data that this program may have.
     pub(crate) fn fits(self, setup: &'static Setup, sub: u8) -> bool {
-        let is_sound = || self.bytes(setup) == Self { flaw: Flaw::None, ..self }.bytes(setup);
+        // A block has its data whatever its number is.
+        let is_numbered = matches!(self.flaw, Flaw::Number(_));
+        let is_sound = || is_numbered || self.bytes(setup) == Self { flaw: Flaw::None, ..self }.bytes(setup);
         // Another address is in the first bytes; any other flaw may come after accepted ones.
         let is_first = matches!(self.flaw, Flaw::Address(_) | Flaw::Stranger) || self.is_unsealed(setup);
         let is_late = self.is_stream(setup, sub) && !is_first;

@@ -160,8 +160,7 @@ impl Model {
         let layout = self.setup.layout;
         let mut flash = self.rig.chip.clone();
         let mut store = Store::open(&flash, layout, self.mistake);
-        if let Some(decision::Store::CrashCount(count)) =
-            choice(&flash, &store, layout, cause, request).store
+        if let Some(decision::Store::CrashCount(count)) = choice(&flash, &store, layout, cause, request).store
         {
             store.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
             let _ = run(&mut flash, |flash, outcome| store.next(flash, outcome));

@@ -13,26 +13,39 @@ use crate::rules::{broken, History};
 use crate::script;
 
 /// A broken rule, and what was found.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Broken(pub &'static str, pub String);
+
+impl fmt::Display for Broken {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "not true that {}: {}", self.0, self.1)
+    }
+}
 
 /// What attacks have met: the states of a renewal with the origin of the bootloader, the lives of the device, and the
 /// programs that were installed.
 #[derive(Default)]
 pub struct Met {
     pub programs: u64,
+    /// The actions that were refused.
+    pub refused: u64,
     pub states: BTreeSet<(u8, u8)>,
     pub lives: u64,
 }
 
 /// An attack on a device.
 pub struct Attack<'a, D> {
-    pub(crate) device: D,
-    pub(crate) history: History,
+    device: D,
+    history: History,
     met: &'a mut Met,
 }
 
 impl<D: Device> Attack<'_, D> {
+    /// The device after it.
+    pub fn device(&self) -> &D {
+        &self.device
+    }
+
     /// Carries out an action, and checks all rules; the device's answer.
     fn act(&mut self, action: &Action) -> Result<Result<(), AbortCode>, Broken> {
         if let Action::Renew(image) = action {
@@ -44,6 +57,7 @@ impl<D: Device> Attack<'_, D> {
             let text = text.or(cause.downcast_ref::<&str>().copied());
             Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
         })?;
+        self.met.refused += u64::from(answer.is_err());
         self.history.note(action, answer);
         if let Some(rule) = broken(&self.history, &seen) {
             return Err(Broken(rule.name, format!("before: {:X?}\n  now: {seen:X?}", self.history.seen)));
@@ -151,8 +165,7 @@ pub struct Failure {
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Broken(rule, what) = &self.broken;
-        writeln!(f, "seed {}: not true that {rule}: {what}\n  the actions, shortened:", self.seed)?;
+        writeln!(f, "seed {}: {}\n  the actions, shortened:", self.seed, self.broken)?;
         self.actions.iter().enumerate().try_for_each(|(n, action)| writeln!(f, "  {n:>3} {action:?}"))
     }
 }

@@ -77,7 +77,10 @@ impl History {
             named: BTreeSet::new(),
             asked: BTreeSet::new(),
             started: None,
-            sent: Vec::new(),
+            sent: (1..)
+                .zip(&seen.programs)
+                .filter_map(|(n, is)| Some((n, is.record?.crc, is.counter)))
+                .collect(),
             nodes: vec![seen.node],
             stores: false,
             seen,
@@ -155,7 +158,8 @@ impl History {
 
     /// What 2006h may name: the content whose block 0 came, if no other content came for this program.
     fn begin(&mut self, sub: u8, sent: Sent) {
-        let is_pure = matches!(sent.part, Part::Block(_)) && sent.flaw == Flaw::None && !self.setup.takes_sealed;
+        let is_pure =
+            matches!(sent.part, Part::Block(_)) && sent.flaw == Flaw::None && !self.setup.takes_sealed;
         match self.begun.iter_mut().find(|(of, _)| *of == sub) {
             Some((_, begun)) if is_pure && *begun == Some(sent.content) => {}
             Some((_, begun)) => *begun = None,
@@ -408,7 +412,9 @@ fn counter_of(before: &History, number: u8, program: &Program) -> u32 {
 
 fn is_counted(before: &History, now: &Seen) -> bool {
     before.setup.config.download.seal.counter_with_confirmation
-        || (1..).zip(&now.programs).all(|(number, program)| program.counter >= counter_of(before, number, program))
+        || (1..)
+            .zip(&now.programs)
+            .all(|(number, program)| program.counter >= counter_of(before, number, program))
 }
 
 fn follows(before: &History, now: &Seen) -> bool {

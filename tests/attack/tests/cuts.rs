@@ -68,7 +68,9 @@ fn a_cut_shows_every_seeded_bug_where_it_should() {
                 ("update", false, "data are not changed while a record for them is valid")
             }
             // CLEAR alone loses nothing: a cut in it leaves the old program.
-            Mistake::EraseBeforeCheck => ("update", false, "a program is lost by CLEAR or by accepted data alone"),
+            Mistake::EraseBeforeCheck => {
+                ("update", false, "a program is lost by CLEAR or by accepted data alone")
+            }
             Mistake::JournalWithoutCrc | Mistake::CompactionInPlace => ("compaction", true, "not true that"),
             Mistake::BlankAtFirstSight => ("update", true, "the recovery does not complete"),
             Mistake::TouchedForgotten => ("erase-and-install", true, "the recovery does not complete"),

@@ -11,8 +11,8 @@ use attack::model::Model;
 use attack::play::{attack, play, Failure, Met};
 use attack::script;
 use kit::rig::{
-    sealed, Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LARGE_JOURNAL, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2, RENEWALS,
-    STANDARD_1, STANDARD_2,
+    sealed, Setup, AT_ONCE_2, ESACADEMY_1, ESACADEMY_2, LARGE_JOURNAL, LIFT_1, LIFT_2, PAULUS_1, PAULUS_2,
+    RENEWALS, STANDARD_1, STANDARD_2,
 };
 
 fn environment(name: &str) -> Option<u64> {

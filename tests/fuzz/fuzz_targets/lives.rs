@@ -35,7 +35,11 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     forget();
     let actions = script::of_bytes(setup, rest);
     let mut met = Met::default();
-    let played = if is_eighth(bytes) { play(new(), &actions, &mut met) } else { act(new(), &actions, &mut met).map(drop) };
+    let played = if is_eighth(bytes) {
+        play(new(), &actions, &mut met)
+    } else {
+        act(new(), &actions, &mut met).map(drop)
+    };
     if let Err((n, broken)) = played {
         panic!("{}, action {n} of {actions:#?}: {broken:?}", setup.name);
     }

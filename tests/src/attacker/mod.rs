@@ -23,7 +23,6 @@
 //! `core/boot-core/tests` attacks the slave.
 
 pub mod board;
-mod broken;
 pub mod line;
 mod masters;
 pub mod model;
@@ -40,11 +39,12 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 use shared_abi::geometry::Region;
 
-pub use broken::Broken;
+pub use attack::play::Broken;
+use kit::model::ModelFlash;
 use kit::random::Random;
 use model::{Ask, Model, Node, NO_NODE};
 use setup::{Image, Setup};
-use target::{Happened, PowerCut, Target, View};
+use target::{Happened, PowerCut, Target};
 
 /// The longest way back from bus-off (`tests/device/hostile_bus.rs`), in us.
 const BUS_OFF_US: u64 = 5_400_000;
@@ -61,6 +61,15 @@ const PASSWORD_US: u64 = 33_000_000;
 /// have is 250 (docs/product.md), which is 125 counts of LSI / 64 (RM0090 section 21.4.3), and the LSI has
 /// 47 kHz at most (datasheet DocID022152).
 const FEED_US: u64 = 125 * 64 * 1_000_000 / 47_000;
+
+// The rules, as what must be true.
+const ANSWERS: &str = "the device answers in time, and what was asked alone";
+const PARAMETERS: &str = "node parameters are those that a master stored";
+const PROGRAMS: &str = "a program changes if somebody asked for it alone";
+const RECORDS: &str = "the record of a program is true";
+const RESETS: &str = "a reset comes if somebody asked for it alone";
+const WATCHDOG: &str = "the watchdog is fed in time";
+const WORKS: &str = "all work ends, and what is touched exists";
 
 /// The counts of an attack.
 #[derive(Clone, Copy, Debug, Default)]
@@ -210,7 +219,7 @@ impl Attack {
         for (sub, part) in (1..).zip(&mut address) {
             let answer = attack.ask([0x40, 0x18, 0x10, sub, 0, 0, 0, 0], attack.target.answer_us())?;
             let Some([0x43, _, _, _, a, b, c, d]) = answer else {
-                return Err(Broken::Answer(format!("1018h/{sub}: {answer:02X?}")));
+                return Err(Broken(ANSWERS, format!("1018h/{sub}: {answer:02X?}")));
             };
             *part = u32::from_le_bytes([a, b, c, d]);
         }
@@ -297,7 +306,7 @@ impl Attack {
                     self.restarted()?;
                 }
                 Happened::Trouble => {
-                    return Err(Broken::Reset("by the watchdog, or the CPU has locked up".into()));
+                    return Err(Broken(RESETS, "by the watchdog, or the CPU has locked up".into()));
                 }
                 Happened::PowerCut => {
                     self.tell(format!("{:>12.3} the power fails", at as f64 / 1000.0));
@@ -324,7 +333,7 @@ impl Attack {
             let id = (id - 0x700) as u8;
             let allowed = self.setup.fixed == Some(id) || self.model.may_be(id);
             if !allowed {
-                return Err(Broken::Parameters(format!("boot-up with node-ID {id}")));
+                return Err(Broken(PARAMETERS, format!("boot-up with node-ID {id}")));
             }
             self.model.booted(id);
         }
@@ -357,7 +366,7 @@ impl Attack {
             }
             self.pass(1000)?;
         }
-        Err(Broken::Other("the masters cannot send".into()))
+        Err(Broken(WORKS, "the masters cannot send".into()))
     }
 
     /// Waits until the device answers, if there were errors: what it does not hear, it cannot obey, and
@@ -462,13 +471,21 @@ impl Attack {
         if self.may_leave() || window || self.target.now_us() < self.leaves_until {
             return Ok(());
         }
-        Err(Broken::Reset("nobody asked for it".into()))
+        Err(Broken(RESETS, "nobody asked for it".into()))
+    }
+
+    /// The contents of the flash, to read the journal from.
+    fn view(&mut self) -> ModelFlash {
+        let chip = self.setup.layout.chip;
+        let mut flash = ModelFlash::new(chip);
+        flash.poke(chip.flash.base, self.target.flash());
+        flash
     }
 
     /// The stored node parameters.
     fn stored(&mut self) -> Option<Node> {
         let layout = self.setup.layout;
-        let view = View { bytes: self.target.flash(), layout };
+        let view = self.view();
         let [id, rate, ..] = Journal::open(&view, layout.parameters).get(&view, Key::NODE)?;
         Some((id as u8, rate as u8))
     }
@@ -496,10 +513,10 @@ impl Attack {
         self.summary.unfed_us = self.target.longest_between_feeds_us();
         if self.summary.unfed_us > FEED_US {
             let us = self.summary.unfed_us;
-            return Err(Broken::Watchdog(format!("fed after {us} us; {FEED_US} is allowed")));
+            return Err(Broken(WATCHDOG, format!("fed after {us} us; {FEED_US} is allowed")));
         }
         if let Some(what) = self.target.complaint() {
-            return Err(Broken::Other(what));
+            return Err(Broken(WORKS, what));
         }
         if self.setup.delays_resets() && self.may_leave() && !self.was_reset {
             self.leaves_until = self.target.now_us() + PASSWORD_US;
@@ -551,7 +568,7 @@ impl Attack {
                 _ if now < begun + patience => self.pass(50_000)?,
                 answer => {
                     let ms = patience.max(self.target.answer_us()) / 1000;
-                    return Err(Broken::Answer(format!("a read of 1000h: {answer:02X?} within {ms} ms")));
+                    return Err(Broken(ANSWERS, format!("a read of 1000h: {answer:02X?} within {ms} ms")));
                 }
             }
         }
@@ -578,7 +595,7 @@ impl Attack {
             quiet = if now == before && !now.1 { quiet + 1 } else { 0 };
             before = now;
             if self.target.now_us() > until {
-                return Err(Broken::Other("the work on the flash does not end".into()));
+                return Err(Broken(WORKS, "the work on the flash does not end".into()));
             }
         }
         Ok(())
@@ -592,13 +609,13 @@ impl Attack {
             let at = (region.base - layout.chip.flash.base) as usize;
             at..at + region.size as usize
         };
-        let view = View { bytes: &now, layout };
+        let view = self.view();
         let journal = Journal::open(&view, layout.parameters);
         let stored = journal.get(&view, Key::NODE).map(|[id, rate, ..]| (id as u8, rate as u8));
         self.model.stored_is(stored)?;
         for own in [Some(layout.bootloader), layout.home, layout.data].into_iter().flatten() {
             if now[place(own)] != self.flash[place(own)] {
-                return Err(Broken::Program(format!("{:08X}h: the bootloader, or the data", own.base)));
+                return Err(Broken(PROGRAMS, format!("{:08X}h: the bootloader, or the data", own.base)));
             }
         }
         for (program, region) in (1..).zip(layout.programs) {
@@ -611,14 +628,14 @@ impl Attack {
                 .any(|ask| matches!(ask, Ask::Download | Ask::AnyControl | Ask::Password | Ask::Control(3)));
             let cells = place(*region);
             if !may_change && now[cells.clone()] != self.flash[cells.clone()] {
-                return Err(Broken::Program(format!("program {program}: its flash has changed")));
+                return Err(Broken(PROGRAMS, format!("program {program}: its flash has changed")));
             }
             let content = |record: ProgramRecord| (record.size, record.crc);
             if !may_change && record.map(content) != was.map(content) {
-                return Err(Broken::Program(format!("program {program}: from {was:?} to {record:?}")));
+                return Err(Broken(PROGRAMS, format!("program {program}: from {was:?} to {record:?}")));
             }
             if asked.is_empty() && !self.is_app && record != was && !self.was_reset {
-                return Err(Broken::Program(format!("program {program}: from {was:?} to {record:?}")));
+                return Err(Broken(PROGRAMS, format!("program {program}: from {was:?} to {record:?}")));
             }
             if let Some(record) = record {
                 let size = record.size.min(region.size) as usize;
@@ -629,13 +646,13 @@ impl Attack {
                 // Data may be any bytes.
                 let sent = is_data || images.iter().any(sent);
                 if crc != record.crc || record.size > region.size || !sent {
-                    return Err(Broken::Record(format!("program {program}: {record:X?}, flash {crc:08X}")));
+                    return Err(Broken(RECORDS, format!("program {program}: {record:X?}, flash {crc:08X}")));
                 }
             }
             self.records[at] = record;
         }
         if self.is_app && self.records.iter().all(Option::is_none) {
-            return Err(Broken::Record("an application runs, and no program has a record".into()));
+            return Err(Broken(RECORDS, "an application runs, and no program has a record".into()));
         }
         self.flash = now;
         Ok(())

@@ -7,7 +7,7 @@ use canopen::lss::LssAddress;
 use canopen::Frame;
 use embedded_can::Frame as _;
 
-use super::broken::Broken;
+use super::{Broken, ANSWERS, PARAMETERS};
 
 /// The start of a change of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -176,7 +176,7 @@ impl Model {
             self.stored = storing;
             return Ok(());
         }
-        Err(Broken::Parameters(format!("stored are {found:?}, and masters stored {:?}", self.stored)))
+        Err(Broken(PARAMETERS, format!("stored are {found:?}, and masters stored {:?}", self.stored)))
     }
 
     /// The check was made: what was asked for has had its effect.
@@ -236,10 +236,10 @@ impl Model {
             return Ok(());
         }
         let Some(bytes) = frame.exactly::<8>() else {
-            return Err(Broken::Answer(format!("{frame}: no frame of LSS")));
+            return Err(Broken(ANSWERS, format!("{frame}: no frame of LSS")));
         };
         let Some((_, asked)) = self.may_answer.take().filter(|(command, _)| *command == bytes[0]) else {
-            return Err(Broken::Answer(format!("{frame}: LSS answers what nobody asked")));
+            return Err(Broken(ANSWERS, format!("{frame}: LSS answers what nobody asked")));
         };
         match (asked[0], bytes[1]) {
             (0x11, 0) => self.pending = (asked[1] != NO_NODE).then_some(asked[1]),

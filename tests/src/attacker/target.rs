@@ -1,10 +1,7 @@
 //! What an attacker sees of a device: its bus, its power and its flash.
 
-use boot_core::flash::{Flash, FlashFault, Operation};
 use canopen::Frame;
-use shared_abi::geometry::Sector;
 use shared_abi::layout::Layout;
-use std::task::Poll;
 
 use kit::random::Random;
 
@@ -101,33 +98,4 @@ pub trait Target {
 
     /// What the device did that it must not do and no rule names; `None` for nothing.
     fn complaint(&mut self) -> Option<String>;
-}
-
-/// Flash contents to read the journal from.
-pub struct View<'f> {
-    /// The bytes, from the start of the chip's flash.
-    pub bytes: &'f [u8],
-    /// The layout of the device.
-    pub layout: &'static Layout,
-}
-
-impl Flash for View<'_> {
-    fn read(&self, address: u32, buffer: &mut [u8]) {
-        for (n, byte) in (0..).zip(buffer) {
-            let at = address.wrapping_add(n).wrapping_sub(self.layout.chip.flash.base);
-            *byte = self.bytes.get(at as usize).copied().unwrap_or(0xFF);
-        }
-    }
-
-    fn start(&mut self, _operation: Operation) -> Result<(), FlashFault> {
-        Err(FlashFault::Protected)
-    }
-
-    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
-        Poll::Ready(Ok(()))
-    }
-
-    fn sector_at(&self, address: u32) -> Option<Sector> {
-        self.layout.chip.sector_at(address)
-    }
 }

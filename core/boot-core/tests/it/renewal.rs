@@ -13,7 +13,6 @@ use kit::bench::{CLR_SIGNATURE as WITHDRAW, SET_SIGNATURE as CONFIRM};
 use kit::boot::{leaked, Boot};
 use kit::ihex;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
-use kit::random::Random;
 use kit::renewal::{
     crc_of, image, image_of, loads, BOARD, HOME, HOST, LAYOUT, PROGRAM, RENEWAL, SOUND, STAGING,
 };
@@ -791,43 +790,6 @@ fn an_older_image_from_a_probe_makes_the_record_of_an_installed_one_void() {
     board.off();
     let journal = Journal::open(&board.flash, LAYOUT.parameters);
     assert_eq!(RenewalRecord::load(&journal, &board.flash), None);
-}
-
-/// The heart: a power cut at any operation, and another one in what follows.
-#[test]
-fn no_cut_leaves_a_device_without_a_bootloader() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let fresh = Board::new(&old);
-    let operations = {
-        let mut board = Board { flash: fresh.flash.clone(), request: None };
-        board.renew(&new);
-        board.flash.operations
-    };
-    let mut random = Random(39);
-    let mut starts = 0;
-    for operation in 1..=operations {
-        for cut in [Cut::Before, Cut::After, Cut::Torn(3), Cut::Torn(4), Cut::Unstable(5), Cut::Unstable(6)] {
-            let mut board = Board { flash: fresh.flash.clone(), request: None };
-            board.flash.cut = Some((operation, cut));
-            assert!(until_power_cut(|| board.renew(&new)));
-            board.off();
-            board.check([&old, &new]);
-            starts += 1;
-            // A second cut in the recovery.
-            let kinds = [Cut::Before, Cut::After, Cut::Torn(7), Cut::Unstable(8)];
-            let second = (1 + random.below(40) as u32, random.pick(&kinds));
-            board.flash.cut = Some(second);
-            until_power_cut(|| board.renew(&new));
-            board.off();
-            board.check([&old, &new]);
-            board.renew(&new);
-            board.off();
-            board.check([&new, &new]);
-            assert_eq!(board.flash.cells(HOME)[..new.len()], new, "{operation} {cut:?} {second:?}");
-            starts += 2;
-        }
-    }
-    assert!(starts > 1_000, "{starts}");
 }
 
 /// While an image is confirmed and not installed, nothing else touches its flash.
