@@ -898,7 +898,7 @@ def service_looks(bench):
         look(url, step)
     # A job file whose device is not there; a package for a lift, which is always locked.
     job = bench.folder / "job.toml"
-    job.write_text("[[device]]\nnode = 9\nimage = 'drive.blk'\n")
+    job.write_text("[[program]]\nimage = 'drive.blk'\nnodes = [9]\n")
     lift = bench.package((bench.image("door"), "nodes = [6]\ndialect = 'lift'"))
     for step, file, end in [("job", job, "none"), ("password", lift, "planned")]:
         _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", file, "--report-dir", bench.folder / "reports")

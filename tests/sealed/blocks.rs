@@ -14,7 +14,7 @@ use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::convert::blocks_of_sealed;
 use coflash_core::file::sealed::{SealedFile, Sealer};
 use coflash_core::update::event::{Note, Phase};
-use coflash_core::update::{flash_sealed, Event, FlashOptions};
+use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
 use shared_abi::block_file::Header;
 
@@ -105,7 +105,7 @@ fn coflash_sends_a_sealed_image_in_blocks() {
     let mut bench = board_with_a_program();
     let file = SealedFile::parse(seal(&sealer(COUNTER), firmware::APP_V2)).unwrap();
     let options = FlashOptions::default().blocks(Some(512));
-    flash_sealed(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
     bench.assert_nothing_unmodelled();
 }
@@ -272,7 +272,7 @@ fn coflash_goes_on_with_a_sealed_image_in_blocks() {
     let file = SealedFile::parse(file).unwrap();
     let options = FlashOptions::default().blocks(Some(512));
     let mut went_on_with = None;
-    flash_sealed(&mut bench.session(), &file, &options, &mut |event| {
+    flash(&mut bench.session(), &file, &options, &mut |event| {
         if let Event::Phase(Phase::GoingOn { done, .. }) = event {
             went_on_with = Some(done);
         }

@@ -1,7 +1,5 @@
 //! The renewal of the bootloader of an emulated board: the steps of a tool, one by one.
 
-use std::sync::Arc;
-
 use canopen::program::{
     FlashStatus, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, STATE_RENEWAL, STATE_VERSIONS,
 };
@@ -9,7 +7,7 @@ use canopen::Address;
 use coflash_core::device::Doing;
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::read::{read, Firmware, Format};
-use coflash_core::update::NewBootloader;
+use coflash_core::update::Payload;
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::time::Span;
 use shared_abi::geometry::Region;
@@ -60,9 +58,9 @@ pub fn version(bootloader: &str, version: u32) -> Vec<u8> {
 /// # Panics
 /// If the image has no header.
 #[must_use]
-pub fn plain(image: &[u8]) -> NewBootloader {
+pub fn plain(image: &[u8]) -> Payload {
     let Ok(Firmware::Image(image)) = read(image, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
-    NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")))
+    RamImage::find(&image).expect("a RAM image").into()
 }
 
 /// The CRC in the header of an image.

@@ -1,20 +1,17 @@
 //! `coflash` detects the dialect of the firmware and updates it accordingly: images and Intel HEX
 //! into the standard bootloader, the profiles of ESAcademy and lifts.
 
-use std::sync::Arc;
-
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::renewal::version as version_of;
+use coboot_tests::renewal::{plain, version as version_of};
 use coflash_core::device::{recognise, Dialect, Doing};
 use coflash_core::file::convert::{program_of, Options, Region};
-use coflash_core::file::ram_image::RamImage;
-use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::file::read::{read, Format};
 use coflash_core::file::Program;
 use coflash_core::update::dialect::read_locked;
 use coflash_core::update::event::{Note, Phase};
-use coflash_core::update::{flash, renew, DeviceState, Event, FlashOptions, NewBootloader, Password, Report};
+use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
 use coflash_core::Error;
 use shared_abi::layout::stm32f407g_disc1_two;
 use shared_abi::ram_image::Version;
@@ -157,12 +154,12 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
 
     // Its bootloader, from the running program and back; each restart wants the password again.
     let new = version_of(&firmware::of_board(layout.board, LIFT), 0x0009_0001);
-    let Ok(Firmware::Image(image)) = read(&new, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
-    let new = NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")));
+    let new = plain(&new);
     let none = FlashOptions::default();
-    let refused = renew(&mut bench.session_with(NODE), &new, &none, &mut |_| {});
+    let refused = flash(&mut bench.session_with(NODE), &new, &none, &mut |_| {});
     assert!(matches!(refused, Err(Error::NoPassword { .. })), "{refused:?}");
-    let renewal = renew(&mut bench.session_with(NODE), &new, &options, &mut |_| {}).unwrap();
+    let report = flash(&mut bench.session_with(NODE), &new, &options, &mut |_| {}).unwrap();
+    let renewal = report.renewal.unwrap();
     assert_eq!((renewal.number, renewal.to), (3, Version(0x0009_0001)), "it follows the set of parameters");
     assert!(version(&mut bench, NODE).contains("2.0.0"), "the program runs again");
 

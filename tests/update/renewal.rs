@@ -11,7 +11,7 @@ use coboot_tests::sealed_board;
 use coflash_core::device::{info, Doing};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::event::Phase;
-use coflash_core::update::{flash, renew, Event, FlashOptions, NewBootloader, Password, Renewal};
+use coflash_core::update::{flash, Event, FlashOptions, Password, Payload, Renewal};
 use coflash_core::Error;
 use emulator::machine::{Cut, FlashCut, Operation};
 use shared_abi::handoff::ResetCause;
@@ -32,14 +32,14 @@ fn install(bench: &mut Bench, program: &str) {
     assert!(!bench.is_bootloader(NODE));
 }
 
-fn renewed(bench: &mut Bench, new: &NewBootloader) -> (Result<Renewal, Error>, Vec<Phase>) {
+fn renewed(bench: &mut Bench, new: &Payload) -> (Result<Renewal, Error>, Vec<Phase>) {
     let mut phases = Vec::new();
-    let result = renew(&mut bench.session(), new, &FlashOptions::default(), &mut |event| {
+    let result = flash(&mut bench.session(), new, &FlashOptions::default(), &mut |event| {
         if let Event::Phase(phase) = event {
             phases.push(phase);
         }
     });
-    (result, phases)
+    (result.map(|report| report.renewal.unwrap()), phases)
 }
 
 fn progress(bench: &mut Bench) -> Progress {
@@ -120,8 +120,7 @@ fn a_bootloader_that_does_not_come_up_is_named_with_the_reason() {
 #[test]
 fn an_interrupted_renewal_goes_on_when_it_is_started_again() {
     let new = plain(&version(firmware::BOOTLOADER, NEW));
-    let NewBootloader::Plain(image) = &new else { unreachable!() };
-    let words = image.bytes().len() as u64 / 4;
+    let words = u64::from(new.size()) / 4;
     for operation in [words / 2, words + words / 2] {
         let mut bench = board();
         bench.machine().cut_power_at(Some(FlashCut { operation, when: Cut::Torn { seed: 7 } }));
@@ -200,7 +199,8 @@ fn assert_wants_a_password(bootloader: &str, node: u8, right: Option<&str>, othe
     let new = plain(&version(bootloader, NEW));
     let renewed = |bench: &mut Bench, password: Option<&str>| {
         let options = FlashOptions::default().unlock(password.and_then(Password::new));
-        renew(&mut bench.session_with(node), &new, &options, &mut |_| {})
+        let report = flash(&mut bench.session_with(node), &new, &options, &mut |_| {});
+        report.map(|report| report.renewal.unwrap())
     };
     bench.machine().keep_flash_log();
     for other in others {

@@ -1,18 +1,14 @@
 //! `coflash` renews a bootloader from whatever state an earlier renewal has left the device in.
 
-use std::sync::Arc;
-
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{
-    confirm, crc_of, identification, number, progress, running, stage, start, version,
+    confirm, crc_of, identification, number, plain, progress, running, stage, start, version,
 };
 use coflash_core::device::Doing;
-use coflash_core::file::ram_image::RamImage;
-use coflash_core::file::read::{read, Firmware, Format};
-use coflash_core::update::{renew, FlashOptions, NewBootloader, Renewal};
+use coflash_core::update::{flash, FlashOptions, Renewal};
 use coflash_core::Error;
 use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, State};
@@ -26,10 +22,9 @@ fn board() -> Bench {
 }
 
 fn renewed(bench: &mut Bench, to: u32) -> Result<Renewal, Error> {
-    let bytes = version(firmware::BOOTLOADER, to);
-    let Ok(Firmware::Image(image)) = read(&bytes, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
-    let new = NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")));
-    renew(&mut bench.session(), &new, &FlashOptions::default(), &mut |_| {})
+    let new = plain(&version(firmware::BOOTLOADER, to));
+    let report = flash(&mut bench.session(), new, &FlashOptions::default(), &mut |_| {});
+    report.map(|report| report.renewal.unwrap())
 }
 
 /// Two renewals without a restart between them: the first image still runs from staging.

@@ -13,9 +13,10 @@ use coflash_core::file::convert::{blocks_of_sealed, Label};
 use coflash_core::file::limit::read_text;
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
-use coflash_core::update::job::{self, Entry, Settings};
+use coflash_core::machine::{Recipe, RecipeDevice, Row};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash_core::update::{flash_program, Event, FlashOptions, Judging, Payload};
+use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload};
+use seal::wire::BOOTLOADER;
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -78,7 +79,7 @@ pub(super) struct Flash {
           conflicts_with = "node_id")]
     node: Vec<Vec<NodeId>>,
 
-    /// A job file, which names the devices and their programs (see the manual), in place of FILE
+    /// A job file: a recipe (see the manual), which names the programs and their devices, in place of FILE
     /// and --node.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "node_id", "vid"])]
     job: Option<PathBuf>,
@@ -284,17 +285,26 @@ impl Flash {
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
         let image = self.image().ok_or_else(unnamed)?;
-        let file = self.payload(context, image, self.number(), &self.source, self.labels.label(image)?)?;
-        let options = self.options(&file, &Settings::default())?;
+        let file = self.payload(
+            context,
+            image,
+            self.number(),
+            &self.source,
+            self.labels.label(image)?,
+            self.access.dialect(),
+        )?;
+        let options = self.options(&file, None)?;
         match &file {
             Payload::Program(program) => {
                 let (size, crc) = (program.size(), program.crc());
                 context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
             }
-            Payload::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
-            Payload::Bootloader(new) => {
-                let (version, size, crc) = (new.version(), new.size(), new.crc());
-                let image = image.display();
+            Payload::Sealed(file) if file.head().program() != BOOTLOADER => {
+                context.out.say(format_args!("{}: {}", image.display(), brief(file)));
+            }
+            new => {
+                let version = new.bootloader().map(|version| version.to_string()).unwrap_or_default();
+                let (image, size, crc) = (image.display(), new.size(), new.crc());
                 context
                     .out
                     .say(format_args!("{image}: bootloader {version} of {size} bytes, CRC {crc:08X}h"));
@@ -324,30 +334,32 @@ impl Flash {
     /// The devices of a job file. Every image is read and checked before any device is changed.
     fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
         // Devices with the same image share it.
-        let mut known: Vec<(PathBuf, Option<String>, u8, Payload)> = Vec::new();
+        let mut known: Vec<(PathBuf, Option<String>, u8, Option<Dialect>, Payload)> = Vec::new();
         let mut devices = Vec::new();
         let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
-        let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
-        for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
-            let Entry { node, address, settings, .. } = entry;
-            let image = settings.image.clone().unwrap_or_default();
-            let program = settings.program.unwrap_or(self.number());
-            let same = known.iter().find(|(path, board, number, _)| {
-                (path, board, *number) == (&image, &settings.board, program)
+        let wrong = |fault| Failure::recipe(job, &fault);
+        let recipe = Recipe::parse(&text, job.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
+        for device in recipe.devices().map_err(wrong)? {
+            let row = device.row;
+            let dialect = device.dialect.or(self.access.dialect());
+            let (image, program) = (row.image.clone(), row.program.unwrap_or(self.number()));
+            let same = known.iter().find(|(path, board, number, its, _)| {
+                (path, board, *number, *its) == (&image, &row.board, program, dialect)
             });
             let file = match same {
                 Some((.., file)) => file.clone(),
                 None => {
-                    let source = match &settings.board {
+                    let source = match &row.board {
                         Some(board) => self.source.for_board(board),
                         None => self.source.clone(),
                     };
-                    let file = self.payload(context, &image, program, &source, Label::default())?;
-                    known.push((image.clone(), settings.board.clone(), program, file.clone()));
+                    let file = self.payload(context, &image, program, &source, Label::default(), dialect)?;
+                    known.push((image.clone(), row.board.clone(), program, dialect, file.clone()));
                     file
                 }
             };
-            let options = self.options(&file, &settings)?.program(program);
+            let options = self.options(&file, Some(&device))?.program(program).dialect(dialect);
+            let (node, address) = (device.node, device.address);
             devices.push(Assignment { node, address, image, file, options });
         }
         Ok(devices)
@@ -361,12 +373,14 @@ impl Flash {
         program: u8,
         source: &Source,
         label: Label,
+        dialect: Option<Dialect>,
     ) -> Result<Payload, Failure> {
         let judging = if self.force { Judging::Nothing } else { Judging::Whole };
-        let reading = source.reading(program, label)?.dialect(self.access.dialect()).judging(judging);
+        let reading = source.reading(program, label)?.dialect(dialect).judging(judging);
         let loaded = reading.read(path, &bytes(path)?).map_err(|fault| Failure::content(path, fault))?;
         warn(context, path, &loaded.notes, loaded.left_out);
-        if let (Payload::Sealed(file), true) = (&loaded.payload, self.in_blocks) {
+        let in_blocks = self.in_blocks && !loaded.payload.is_bootloader();
+        if let (Payload::Sealed(file), true) = (&loaded.payload, in_blocks) {
             // The device reports the program's start address later; this checks now whether such blocks
             // are possible.
             blocks_of_sealed(file, 0, source.block_size()).map_err(|error| Failure::convert(error, path))?;
@@ -374,14 +388,18 @@ impl Flash {
         Ok(loaded.payload)
     }
 
-    /// The options of the command line, unless the device's own settings replace them.
-    fn options(&self, file: &Payload, settings: &Settings) -> Result<FlashOptions, Failure> {
-        let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
+    /// The options of the command line, unless the row of a job replaces them.
+    fn options(&self, file: &Payload, device: Option<&RecipeDevice<'_>>) -> Result<FlashOptions, Failure> {
+        let row = device.map(|device| device.row);
+        let check = row.and_then(|row| row.check_target);
+        let check = check.unwrap_or(self.check_target || self.legacy.check_target());
         let advice = "convert it with --vid and --pid, or give these options here";
         let unnamed = || Failure::usage("the file does not name its target device", advice);
-        let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
-        let trial = settings.trial_run.unwrap_or(!(self.no_trial || self.is_untried(file)));
-        let start = settings.start.unwrap_or(!self.no_start);
+        let named = row.and_then(Row::target);
+        let of_file = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
+        let trial = row.and_then(|row| row.trial_run);
+        let trial = trial.unwrap_or(!(self.no_trial || self.is_untried(file)));
+        let start = row.and_then(|row| row.start).unwrap_or(!self.no_start);
         if file.is_bootloader() && !(trial && start) {
             let advice =
                 "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
@@ -390,11 +408,11 @@ impl Flash {
         Ok(FlashOptions::default()
             .program(self.number())
             .repeats(self.block_repeats)
-            .check_target(check_target)
+            .check_target(named.or(of_file))
             .trial_run(trial)
             .watch(self.watch)
             .start(start)
-            .verify(settings.verify.unwrap_or(self.verify))
+            .verify(row.and_then(|row| row.verify).unwrap_or(self.verify))
             .dialect(self.access.dialect())
             .unlock(self.access.unlock())
             .wait(self.wait)
@@ -441,7 +459,7 @@ impl Flash {
         let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out, node);
         let mut left = None;
-        let result = flash_program(&mut session, &device.file, &device.options, &mut |event| match event {
+        let result = flash(&mut session, &device.file, &device.options, &mut |event| match event {
             Event::Done(done) => {
                 left = Some(done.left);
                 progress.show(Event::Done(done));

@@ -16,7 +16,6 @@ use coflash_core::file::convert::ConvertError;
 use coflash_core::file::sealed::Refusal;
 use coflash_core::file::{judge, Cause, FileError};
 use coflash_core::machine;
-use coflash_core::update::job::Fault;
 use coflash_core::update::{refusal_number, ContentFault, DeviceAfterUpdate, DeviceAnswer};
 use coflash_core::Error;
 use serde_json::{json, Value};
@@ -380,12 +379,7 @@ impl Failure {
         Self { number, legacy, ..Self::bare_usage(error.render().to_string()) }
     }
 
-    /// An error in a job file.
-    pub(super) fn job(path: &Path, fault: &Fault) -> Self {
-        Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
-    }
-
-    /// An error in the recipe of a package.
+    /// An error in a recipe.
     pub(super) fn recipe(path: &Path, fault: &machine::RecipeFault) -> Self {
         Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
     }

@@ -54,9 +54,9 @@ impl MakePackage {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.recipe;
         let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-        let Recipe { name, release, parts, images } =
-            Recipe::read(&text, path.parent().unwrap_or(Path::new("")))
-                .map_err(|fault| Failure::recipe(path, &fault))?;
+        let wrong = |fault| Failure::recipe(path, &fault);
+        let recipe = Recipe::parse(&text, path.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
+        let parts = recipe.parts().map_err(wrong)?;
         let keys = self.key.iter().map(|path| signing_key(path)).collect::<Result<Vec<_>, _>>()?;
         let certificates =
             self.cert.iter().map(|path| keys::certificate(path)).collect::<Result<Vec<_>, _>>()?;
@@ -78,14 +78,14 @@ impl MakePackage {
             let advice = "give each certificate with its key";
             return Err(Failure::usage("a certificate belongs to none of the keys", advice));
         }
-        let bytes =
-            machine::make(name, release, &parts, &pairs).map_err(|fault| Failure::package(path, &fault))?;
+        let bytes = machine::make(recipe.name, recipe.release, &parts, &pairs)
+            .map_err(|fault| Failure::package(path, &fault))?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("cpk"));
         let advice = "name the package with --output";
         if is_same(&output, path) {
             return Err(Failure::usage("the package would replace its recipe", advice));
         }
-        if images.iter().any(|image| is_same(&output, image)) {
+        if recipe.programs.iter().any(|row| is_same(&output, &row.image)) {
             return Err(Failure::usage("the package would replace an image of its recipe", advice));
         }
         output_file::write(&output, &bytes)?;

@@ -117,8 +117,9 @@ fn of_job(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
         return Err(Failure::usage("a job file has no signature", advice));
     }
     let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-    let Recipe { name, release, parts, .. } = Recipe::of_job(&text, path.parent().unwrap_or(Path::new("")))
-        .map_err(|fault| Failure::job(path, &fault))?;
-    let made = machine::make(name, release, &parts, &[]).and_then(|bytes| Package::parse(&bytes));
-    made.map_err(|fault| Failure::package(path, &fault))
+    let wrong = |fault| Failure::recipe(path, &fault);
+    let recipe = Recipe::parse(&text, path.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
+    let made =
+        machine::make(recipe.name.clone(), recipe.release.clone(), &recipe.parts().map_err(wrong)?, &[]);
+    made.and_then(|bytes| Package::parse(&bytes)).map_err(|fault| Failure::package(path, &fault))
 }

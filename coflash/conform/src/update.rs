@@ -11,7 +11,7 @@ use super::bench::{failed, request, skipped, Bench, Stop};
 use super::check::Check;
 use coflash_core::device::{DeviceType, Doing, Error, Session};
 use coflash_core::file::block_file::BlockFile;
-use coflash_core::update::{flash_program, steps, FlashOptions, Payload};
+use coflash_core::update::{flash, steps, FlashOptions, Payload};
 
 const PROCEDURE: &str = "L-1112, procedure in principle";
 const COMMANDS: &str = "L-1112, table 2";
@@ -155,7 +155,7 @@ const fn check(
 fn install(b: &mut Bench<'_>, from_start: bool) -> Result<(), Stop> {
     let program = b.image()?.clone();
     let options = FlashOptions::default().from_start(from_start);
-    b.with(|session| flash_program(session, &program, &options, &mut |_| {})).map(drop)
+    b.with(|session| flash(session, &program, &options, &mut |_| {})).map(drop)
 }
 
 fn device_type(b: &mut Bench<'_>) -> Result<DeviceType, Stop> {

@@ -99,7 +99,7 @@ fn flash<'py>(
         session.cancel_by(cancelled);
         // The receiver is gone only if the update was cancelled.
         let mut tell = |event: update::Event| drop(events.send(json!(event.line(node))));
-        Ok(update::flash_program(&mut session, &content, &options, &mut tell)?)
+        Ok(update::flash(&mut session, &content, &options, &mut tell)?)
     })?;
     object(py, &report)
 }
@@ -232,8 +232,7 @@ fn node_id(number: u8) -> PyResult<NodeId> {
 
 fn dialect_of(name: &str) -> PyResult<Dialect> {
     let known = || Dialect::ALL.map(Dialect::name).join(", ");
-    let dialect = Dialect::ALL.into_iter().find(|dialect| dialect.name() == name);
-    dialect
+    Dialect::named(name)
         .ok_or_else(|| PyValueError::new_err(format!("there is no dialect '{name}'; known are {}", known())))
 }
 

@@ -11,7 +11,7 @@ use super::state::{Firmware, Notice, Seal, Settings};
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{ram_image, Program, Target};
-use coflash_core::update::{self, ContentFault, Judging, NewBootloader, Payload, Reading};
+use coflash_core::update::{self, ContentFault, Judging, Payload, Reading};
 
 /// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
@@ -41,8 +41,8 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     let size = bytes.len();
     let shown = match &read.payload {
         Payload::Program(program) => of_program(program, &read, size, name),
-        Payload::Sealed(file) => of_sealed(file, size, name),
-        Payload::Bootloader(new) => of_bootloader(new, size, name),
+        Payload::Sealed(file) if !read.payload.is_bootloader() => of_sealed(file, size, name),
+        new => of_bootloader(new, size, name),
     };
     Ok(Loaded { bytes, program: read.payload, shown })
 }
@@ -89,19 +89,20 @@ fn of_program(program: &Program, read: &update::Loaded, size: usize, name: Strin
 }
 
 /// A bootloader, which takes the place of that of the device.
-fn of_bootloader(new: &NewBootloader, size: usize, name: String) -> Firmware {
+fn of_bootloader(new: &Payload, size: usize, name: String) -> Firmware {
     let target = new.target();
+    let version = new.bootloader().map(|version| version.to_string());
     Firmware {
         size,
         inspection: format!(
             "a bootloader: it renews that of the device, and the program stays ({})",
-            new.version()
+            version.as_deref().unwrap_or_default()
         ),
         program_size: new.size(),
         crc: new.crc(),
-        vendor_id: Some(target.vendor_id),
-        product_code: Some(target.product_code),
-        version: Some(new.version().to_string()),
+        vendor_id: target.map(|target| target.vendor_id),
+        product_code: target.map(|target| target.product_code),
+        version,
         left_out: 0,
         is_bootloader: true,
         seal: None,

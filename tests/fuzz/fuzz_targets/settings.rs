@@ -1,14 +1,14 @@
-//! Job file and configuration file.
+//! Recipe (also as a job file) and configuration file.
 //!
-//! Must hold: any text gives a job, settings, or a fault with a place inside the text; each device
-//! of a job has an image and a name, and no two are equal; each setting exists and has a value of
+//! Must hold: any text gives a recipe, settings, or a fault with a place inside the text; each device
+//! of a recipe has an image and a name, and no two are equal; each setting exists and has a value of
 //! its kind.
 #![cfg_attr(fuzzing, no_main)]
 
 use std::path::Path;
 
+use coflash_core::machine::{Recipe, RecipeFault};
 use coflash_core::update::config::{self, Setting};
-use coflash_core::update::job;
 
 /// The options of a tool, and whether each is a switch.
 const KEYS: [(&str, bool); 7] = [
@@ -24,18 +24,18 @@ const KEYS: [(&str, bool); 7] = [
 coboot_fuzz::target!(|bytes: &[u8]| {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let lines = text.matches('\n').count() + 1;
-    match job::parse(text, Path::new("folder")) {
-        Err(job::Fault::Line(line, what)) => assert!((1..=lines).contains(&line) && !what.is_empty()),
-        Err(job::Fault::Device(number, what)) => assert!(number >= 1 && !what.is_empty()),
-        Ok(entries) => {
-            assert!(!entries.is_empty());
-            for (i, entry) in entries.iter().enumerate() {
-                assert!(entry.node.is_some() || entry.address.is_some());
-                assert!(entry.settings.image.is_some());
-                assert!(entry.settings.program.is_none_or(|program| (1..=254).contains(&program)));
-                for other in &entries[..i] {
-                    assert!(entry.node.is_none() || entry.node != other.node);
-                    assert!(entry.address.is_none() || entry.address != other.address);
+    let recipe = Recipe::parse(text, Path::new("folder"));
+    match recipe.as_ref().map_err(Clone::clone).and_then(Recipe::devices) {
+        Err(RecipeFault::Line(line, what)) => assert!((1..=lines).contains(&line) && !what.is_empty()),
+        Err(RecipeFault::Program(number, what)) => assert!(number >= 1 && !what.is_empty()),
+        Ok(devices) => {
+            assert!(!devices.is_empty());
+            for (i, device) in devices.iter().enumerate() {
+                assert!(device.node.is_some() || device.address.is_some());
+                assert!(device.row.program.is_none_or(|program| (1..=254).contains(&program)));
+                for other in &devices[..i] {
+                    assert!(device.node.is_none() || device.node != other.node);
+                    assert!(device.address.is_none() || device.address != other.address);
                 }
             }
         }

@@ -7,7 +7,7 @@ use canopen::BitRate;
 use coflash_core::device::Dialect;
 use coflash_core::file::sealed::{SealedFile, Sealer};
 use coflash_core::file::Program;
-use coflash_core::update::{flash, renew, FlashOptions, Payload};
+use coflash_core::update::{flash, FlashOptions, Payload};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
@@ -221,12 +221,7 @@ fn board(bootloader: &'static str, program: &Payload) -> Result<Bench, String> {
     }
     bench.power_on();
     bench.run_ms(BOOT_MS);
-    let installed = coflash_core::update::flash_program(
-        &mut bench.session(),
-        program,
-        &FlashOptions::default(),
-        &mut |_| {},
-    );
+    let installed = flash(&mut bench.session(), program, &FlashOptions::default(), &mut |_| {});
     installed.map_err(|error| error.to_string())?;
     Ok(bench)
 }
@@ -331,7 +326,7 @@ fn renew_bootloader() -> Result<Story, String> {
     const NEW: u32 = 0x0009_0001;
     let new = renewal::plain(&renewal::version(firmware::BOOTLOADER, NEW));
     let mut story = update(move |bench| {
-        let renewed = renew(&mut bench.session(), &new, &FlashOptions::default(), &mut |_| {});
+        let renewed = flash(&mut bench.session(), &new, &FlashOptions::default(), &mut |_| {});
         renewed.map(drop).map_err(|error| error.to_string())
     })?;
     story.from.bootloader = Some(OLD);
@@ -353,9 +348,7 @@ fn seal_with(sealer: Sealer<'_>, image: &str) -> Result<Payload, String> {
 }
 
 fn write_sealed(bench: &mut Bench, program: &Payload) -> Result<(), String> {
-    coflash_core::update::flash_program(&mut bench.session(), program, &options(), &mut |_| {})
-        .map(drop)
-        .map_err(|error| error.to_string())
+    flash(&mut bench.session(), program, &options(), &mut |_| {}).map(drop).map_err(|error| error.to_string())
 }
 
 fn sealed(compress: bool) -> Result<Story, String> {

@@ -165,7 +165,7 @@ fn a_job_file_names_a_board_by_a_file_beside_it() {
     folder.file("my-board.toml", map().as_bytes());
     folder.file("app.hex", &fs::read(data("program.hex")).unwrap());
     let job = |board: &str| {
-        let text = format!("image = 'app.hex'\nboard = '{board}'\nprogram = 2\n[[device]]\nnode = 5\n");
+        let text = format!("board = '{board}'\n[[program]]\nimage = 'app.hex'\nprogram = 2\nnodes = [5]\n");
         let job = folder.file("line.toml", text.as_bytes());
         coflash(&["flash", "--job", &job, "--bus", "socketcand://127.0.0.1:1/x"])
     };

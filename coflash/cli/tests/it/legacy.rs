@@ -229,7 +229,7 @@ fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
     // A job file is none of its words: it says itself whether there is a trial.
     let folder = folder("dot-net-job");
     folder.file("blcop_app.bin", &fs::read(data("plain-400.blk")).unwrap());
-    let job = folder.file("job.toml", b"image = 'blcop_app.bin'\n[[device]]\nnode = 5\n");
+    let job = folder.file("job.toml", b"[[program]]\nimage = 'blcop_app.bin'\nnodes = [5]\n");
     let (bus, server) = serve(quick(BOOTLOADER));
     let done = coflash(&["--bus", &bus, "flash", "--job", &job, "--prog_no", "1"]);
     assert_eq!((done.exit, done.out.contains(NO_TRIAL)), (0, false), "{}", done.err);

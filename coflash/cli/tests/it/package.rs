@@ -1,14 +1,19 @@
 //! Packages for machines: their recipe, and the command line.
 
 use std::fs;
+use std::path::Path;
 
+use canopen::NodeId;
+use coflash_core::device::lss::LssAddress;
 use coflash_core::file::sealed::{Sealer, SigningKey};
-use coflash_core::machine::{make, Identity, Package, Recipe};
+use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
 use crate::tool::{coflash, data, folder};
 
-fn recipe(text: &str, folder: &std::path::Path) -> Result<Recipe, String> {
-    Recipe::read(text, folder).map_err(|fault| fault.to_string())
+fn recipe(text: &str, folder: &Path) -> Result<(Recipe, Vec<Part>), String> {
+    let parsed = Recipe::parse(text, folder);
+    let parts = parsed.and_then(|recipe| recipe.parts().map(|parts| (recipe, parts)));
+    parts.map_err(|fault| fault.to_string())
 }
 
 /// The program of `tests/data` in a raw binary for the flash of a board, by its vectors: a stack in RAM, and a
@@ -32,7 +37,7 @@ fn the_documentations_example_is_a_recipe() {
     fs::write(folder.join("drive.cbs"), sealed).unwrap();
     // The files of the tests are linked for 08010000h, where that board has something else.
     let text = text.replace("board = \"stm32f407g-disc1\"", "");
-    let Recipe { name, release, parts, .. } = recipe(&text, &folder).unwrap();
+    let (Recipe { name, release, .. }, parts) = recipe(&text, &folder).unwrap();
     assert_eq!((name.as_deref(), release.as_deref()), (Some("Press 4"), Some("2026-11")));
     let package = Package::parse(&make(name, release, &parts, &[]).unwrap()).unwrap();
     let shown: Vec<(&str, String)> =
@@ -47,23 +52,83 @@ fn the_documentations_example_is_a_recipe() {
     assert_eq!(counts, [(None, false), (Some(4), false), (None, true)]);
 }
 
-/// One image with two settings is two programs: the second has a name that no other image has.
+/// The example of the page is a job, and so are the devices of a recipe for a package that have node-IDs.
 #[test]
-fn the_programs_of_a_job_have_names_of_their_own() {
-    let folder = folder("recipe-job");
-    for name in ["app.blk", "app (2).blk"] {
-        fs::copy(data("plain-400.blk"), folder.join(name)).unwrap();
+fn the_pages_example_is_a_job() {
+    let page = include_str!("../../../../docs/coflash.md");
+    let mut blocks = page.split("```toml\n").skip(1).filter_map(|block| block.split("```").next());
+    let example = blocks.find(|block| block.contains("[[program]]")).unwrap();
+    let recipe = Recipe::parse(example, Path::new("folder")).unwrap();
+    let devices = recipe.devices().unwrap();
+    let nodes: Vec<_> = devices.iter().filter_map(|device| device.node).map(NodeId::get).collect();
+    assert_eq!(nodes, [5, 7, 6, 9]);
+    let rows: Vec<_> = devices.iter().map(|device| device.row).collect();
+    assert_eq!(
+        (rows[0].trial_run, rows[2].start, rows[0].board.as_deref()),
+        (Some(true), Some(false), Some("stm32f407g-disc1"))
+    );
+    assert_eq!(
+        (&*rows[0].image, &*rows[2].image),
+        (Path::new("folder/app.elf"), Path::new("folder/other.blk"))
+    );
+    let address = LssAddress { vendor_id: 0x3F, product_code: 1, revision: 2, serial_number: 3 };
+    assert_eq!((devices[0].address, devices[3].address), (None, Some(address)));
+}
+
+/// What is wrong with a recipe that is carried out without a package.
+#[test]
+fn a_fault_of_a_job_is_named_with_its_place() {
+    let fault = |text: &str| {
+        let parsed = Recipe::parse(text, Path::new("folder"));
+        parsed.and_then(|recipe| recipe.devices().map(drop)).unwrap_err().to_string()
+    };
+    let one = "[[program]]\nimage = 'a'\n";
+    for (more, words) in [
+        ("", "program 1: it has neither nodes nor lss"),
+        ("nodes = [128]\n", "program 1: node-IDs are 1 to 127"),
+        ("nodes = [300]\n", "line 3: "),
+        ("node = 5\n", "line 3: unknown field `node`"),
+        ("nodes = [1]\nprogram = 255\n", "program 1: programs are 1 to 254"),
+        ("nodes = [1, 2, 1]\n", "program 1: the recipe has one of its devices twice"),
+        (
+            "nodes = [1]\n[[program]]\nimage = 'b'\nnodes = [1]\n",
+            "program 2: the recipe has one of its devices twice",
+        ),
+        ("lss = { vendor = 1 }\n", "product"),
+        (
+            "nodes = [1, 2]\nlss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n",
+            "program 1: one LSS address",
+        ),
+        ("nodes = [1]\ncount = 3\n", "program 1: only a package has revision and count"),
+        ("nodes = [1]\nvendor = 3\n", "program 1: vendor and product belong together"),
+        ("nodes = [1]\ndialect = 'x'\n", "program 1: there is no dialect \"x\""),
+    ] {
+        let fault = fault(&format!("{one}{more}"));
+        assert!(fault.contains(words), "{more:?}: {fault}");
     }
-    let job = "[[device]]\nnode = 5\nimage = 'app.blk'\n[[device]]\nnode = 6\nimage = 'app (2).blk'\n\
-               [[device]]\nnode = 7\nimage = 'app.blk'\nverify = true\n";
-    let parts = Recipe::of_job(job, &folder).unwrap().parts;
-    let names: Vec<_> = parts.iter().map(|part| part.entry.name.as_str()).collect();
-    assert_eq!(names, ["app", "app (2)", "app (3)"]);
-    Package::parse(&make(None, None, &parts, &[]).unwrap()).unwrap();
+    // The job files of before.
+    let before = "[[device]] is of the job files of before: write a [[program]] with image and nodes = [...]";
+    for (text, line) in [
+        ("image = 'a.elf'\ntrial-run = true\nprogram = 2\n[[device]]\nnode = 5\n", 4),
+        ("[[device]]\nnode = 5\nimage = 'a.elf'\n[[device]]\nnode = 6\nimage = 'b.elf'\n", 1),
+    ] {
+        assert!(fault(text).starts_with(&format!("line {line}: {before}")), "{}", fault(text));
+    }
+}
+
+/// A package has what a job has, but for the two settings that are for one device.
+#[test]
+fn a_package_has_no_setting_of_one_device() {
+    let folder = folder("recipe-job");
     fs::write(folder.join("a.bin"), binary()).unwrap();
-    let checked = "board = 'stm32f407g-disc1'\n[[device]]\nnode = 5\nimage = 'a.bin'\ncheck-target = true\n";
-    let fault = Recipe::of_job(checked, &folder).unwrap_err().to_string();
-    assert!(fault.contains("does not say for which device") && fault.contains("no check-target"), "{fault}");
+    for (more, words) in [
+        ("start = false\n", "program 1: each program of a machine is started"),
+        ("lss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n", "program 1: a machine has node-IDs"),
+        ("board = 'stm32f407g-disc1'\ncheck-target = true\n", "does not say for which device it is: it cannot be checked; give no revision without vendor and product, and no check-target"),
+    ] {
+        let fault = recipe(&format!("[[program]]\nimage = 'a.bin'\nnodes = [5]\n{more}"), &folder).unwrap_err();
+        assert!(fault.contains(words), "{fault}");
+    }
 }
 
 /// A sealed image names its device; a plain program without a label does not.
@@ -74,13 +139,13 @@ fn a_file_that_names_its_device_needs_no_other_name() {
     let sealed = sealer.seal(&binary(), &SigningKey::from_seed([1; 32]).unwrap()).unwrap();
     fs::write(folder.join("a.cbs"), sealed).unwrap();
     fs::copy(data("plain-400.blk"), folder.join("b.blk")).unwrap();
-    let parts = recipe("[[program]]\nimage = 'a.cbs'\n", &folder).unwrap().parts;
+    let parts = recipe("[[program]]\nimage = 'a.cbs'\n", &folder).unwrap().1;
     assert_eq!(parts[0].entry.identity, Some(Identity { vendor: 0x3F, product: 7, revision: None }));
-    let parts = recipe("[[program]]\nimage = 'a.cbs'\nrevision = 3\n", &folder).unwrap().parts;
+    let parts = recipe("[[program]]\nimage = 'a.cbs'\nrevision = 3\n", &folder).unwrap().1;
     assert_eq!(parts[0].entry.identity.unwrap().revision, Some(3));
     // Block 0 has vendor 0 and product 1234 (expected.py), as the reference application has.
     fs::copy(data("identity-110.blk"), folder.join("d.blk")).unwrap();
-    let parts = recipe("[[program]]\nimage = 'd.blk'\n", &folder).unwrap().parts;
+    let parts = recipe("[[program]]\nimage = 'd.blk'\n", &folder).unwrap().1;
     assert_eq!(parts[0].entry.identity, Some(Identity { vendor: 0, product: 1234, revision: None }));
     for (text, words) in [
         ("", "line 1: it names no program"),
@@ -158,7 +223,9 @@ fn the_command_makes_and_shows_a_package() {
     let named = folder.join("x.CPK");
     fs::copy(data("plain-400.blk"), &named).unwrap();
     let named = named.to_str().unwrap();
-    let job = folder.write("job.toml", b"image = 'a.blk'\nstart = false\n[[device]]\nnode = 5\n");
+    let job = folder.write("job.toml", b"[[program]]\nimage = 'a.blk'\nnodes = [5]\nstart = false\n");
+    let before = folder.write("before.toml", b"image = 'a.blk'\n[[device]]\nnode = 5\n");
+    let before = before.to_str().unwrap();
     let job = job.to_str().unwrap();
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
@@ -200,7 +267,9 @@ fn the_command_makes_and_shows_a_package() {
         (&["ui", "--trust", &public], 2, "only the signers of a package"),
         (&["ui", "--service", job, "--trust", &public], 2, "a job file has no signature"),
         (&["ui", "--service", job, "--config", config], 2, "a job file has no signature"),
-        (&["ui", "--service", job], 3, "device 1: each program of a machine is started"),
+        (&["ui", "--service", job], 3, "program 1: each program of a machine is started"),
+        (&["ui", "--service", before], 3, "line 2: [[device]] is of the job files of before"),
+        (&["flash", "--job", before], 3, "line 2: [[device]] is of the job files of before"),
     ] {
         let done = coflash(words);
         assert_eq!(done.exit, exit, "{words:?}: {}", done.err);

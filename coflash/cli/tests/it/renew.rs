@@ -41,7 +41,7 @@ fn flash_knows_a_bootloader_by_its_header() {
     assert_eq!((&json["bootloader"]["version"], &json["fault"]), (&NEW.into(), &Value::Null));
 
     // By a job file, too.
-    let job = folder.file("job.toml", b"image = 'new.bin'\n[[device]]\nnode = 5\n");
+    let job = folder.file("job.toml", b"[[program]]\nimage = 'new.bin'\nnodes = [5]\n");
     let (url, server) = serve(device(BOOTLOADER, |_| {}).0);
     let done = coflash(&["--bus", &url, "flash", "--job", &job]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);

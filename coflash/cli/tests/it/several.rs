@@ -69,8 +69,8 @@ fn a_job_file_says_who_gets_what() {
     folder.file("plain.blk", &fs::read(data("plain-400.blk")).unwrap());
     let job = folder.file(
         "job.toml",
-        b"image = 'plain.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nimage = 'small.hex'\nstart = false\n\
-          [[device]]\nnode = 7\ntrial-run = false\n",
+        b"[[program]]\nimage = 'plain.blk'\nnodes = [5]\n[[program]]\nimage = 'small.hex'\nnodes = [6]\n\
+          start = false\n[[program]]\nimage = 'plain.blk'\nnodes = [7]\ntrial-run = false\n",
     );
     let (url, server) =
         serve(Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]));
@@ -172,12 +172,12 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
     let file = data("plain-400.blk");
     let job = |node: &str, serial: u32| {
         let text = format!(
-            "image = '{file}'\n[[device]]\n{node}\nlss = {{ vendor = 0x3F, product = 2, revision = 3, serial = {serial} }}\n"
+            "[[program]]\nimage = '{file}'\n{node}\nlss = {{ vendor = 0x3F, product = 2, revision = 3, serial = {serial} }}\n"
         );
         folder.file("job.toml", text.as_bytes())
     };
     let (url, server) = serve(unconfigured());
-    let done = coflash(&["--bus", &url, "flash", "--job", &job("node = 9", 4)]);
+    let done = coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 4)]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     let bus = server.join().unwrap();
     assert_eq!((bus.fake.node, bus.fake.blocks.concat()), (9, fs::read(&file).unwrap()));
@@ -190,7 +190,7 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
     for (node, serial, words) in [
         ("", 4, "device with serial number 00000004h: error: the device has no node-ID [0x60000017]"),
         (
-            "node = 9",
+            "nodes = [9]",
             5,
             "node 9: error: no device answers (selecting the device by its LSS address) [0x60000013]",
         ),

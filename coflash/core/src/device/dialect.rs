@@ -42,6 +42,12 @@ impl Dialect {
         }
     }
 
+    /// The dialect with this name.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|dialect| dialect.name() == name)
+    }
+
     /// The dialect of a bootloader with this device type at this node-ID; `None` for an application
     /// or an unknown device type.
     #[must_use]

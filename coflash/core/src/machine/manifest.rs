@@ -211,8 +211,7 @@ impl Entry {
     /// The dialect of the devices, if the package names it.
     #[must_use]
     pub fn dialect(&self) -> Option<Dialect> {
-        let name = self.dialect.as_deref()?;
-        Dialect::ALL.into_iter().find(|dialect| dialect.name() == name)
+        Dialect::named(self.dialect.as_deref()?)
     }
 
     /// The hash of its member.

@@ -1,7 +1,6 @@
 //! A package: its members, read, checked and parsed, before anything of it is used.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
 use shared_abi::block_file::ProgramVersion;
@@ -16,7 +15,7 @@ use crate::file::sealed::show::digits;
 use crate::file::sealed::{PublicKey, SealedFile, SigningKey};
 use crate::file::{self, Firmware, Format, Target};
 use crate::update::dialect::is_data;
-use crate::update::{NewBootloader, Payload};
+use crate::update::Payload;
 use seal::wire::CERTIFICATE;
 
 /// A package whose members were checked.
@@ -177,18 +176,18 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Payload, Fault> {
     let unusable = |why: String| Fault::Program { program: entry.name.clone(), why };
     let format = Format::detect(bytes);
     let program = match format {
-        Some(Format::Sealed) if entry.is_bootloader() => {
-            let new = NewBootloader::of_sealed(bytes);
-            Payload::from(new.ok_or_else(|| unusable("it is a sealed program and no bootloader".to_owned()))?)
-        }
-        None if entry.is_bootloader() => {
-            let new = NewBootloader::in_file(bytes, Some(Format::Raw));
+        Some(Format::Sealed) | None if entry.is_bootloader() => {
+            let new = Payload::bootloader_in(bytes, format.or(Some(Format::Raw)));
+            let no_bootloader = match format {
+                Some(_) => "it is a sealed program and no bootloader",
+                None => "it is no bootloader",
+            };
             let new = new.map_err(|fault| unusable(format!("it {fault}")))?;
-            Payload::from(new.ok_or_else(|| unusable("it is no bootloader".to_owned()))?)
+            new.ok_or_else(|| unusable(no_bootloader.to_owned()))?
         }
         Some(Format::Sealed) => {
             let file = SealedFile::for_program(bytes.to_vec(), entry.program);
-            Payload::from(Arc::new(file.map_err(|refusal| unusable(refusal.to_string()))?))
+            Payload::from(file.map_err(|refusal| unusable(refusal.to_string()))?)
         }
         Some(Format::BlockFile) if !entry.is_bootloader() => {
             let blocks = match file::read(bytes, format, None).map_err(|error| unusable(error.to_string()))? {
@@ -205,7 +204,7 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Payload, Fault> {
                 let judged = judge(blocks.image(), blocks.start(), None);
                 judged.map_err(|fault| unusable(format!("the image {fault}")))?;
             }
-            Payload::from(Arc::new(blocks))
+            Payload::from(blocks)
         }
         _ => return Err(unusable("it is neither a block file nor a sealed image".to_owned())),
     };
@@ -228,15 +227,15 @@ pub(super) fn target(program: &Payload) -> Option<Identity> {
 /// The version of a program, if it has one.
 #[must_use]
 pub fn version(program: &Payload) -> Option<String> {
-    match program {
-        Payload::Bootloader(new) => Some(new.version().to_string()),
-        Payload::Sealed(file) => Some(ProgramVersion(file.head().version()).to_string()),
+    let version = match program {
         Payload::Program(program) => {
             let named = program.release().map(|release| release.version);
-            let version = named.or_else(|| Some(ProgramVersion(program.label()?.version)))?;
-            Some(version.to_string())
+            named.or_else(|| Some(ProgramVersion(program.label()?.version)))?
         }
-    }
+        Payload::Sealed(file) if !program.is_bootloader() => ProgramVersion(file.head().version()),
+        bootloader => return Some(bootloader.bootloader()?.to_string()),
+    };
+    Some(version.to_string())
 }
 
 /// The kind of a program, in words.
@@ -244,8 +243,8 @@ pub fn version(program: &Payload) -> Option<String> {
 pub fn kind(program: &Payload) -> &'static str {
     match program {
         Payload::Program(_) => "program",
+        Payload::Sealed(_) if program.is_bootloader() => "sealed bootloader",
         Payload::Sealed(_) => "sealed program",
-        Payload::Bootloader(NewBootloader::Plain(_)) => "bootloader",
-        Payload::Bootloader(NewBootloader::Sealed(_)) => "sealed bootloader",
+        Payload::Bootloader(_) => "bootloader",
     }
 }

@@ -16,7 +16,7 @@ use crate::device::info::{self, program_info, DeviceInfo, ProgramInfo};
 use crate::device::scan::{scan, Found, ScanOptions};
 use crate::device::{Error, Session};
 use crate::json;
-use crate::update::{NewBootloader, Payload};
+use crate::update::Payload;
 use coboot_can::Adapter;
 
 /// Why there is no plan.
@@ -167,8 +167,8 @@ pub fn plan(
     for device in &mut plan.devices {
         let Some(its) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
         for step in &mut device.steps {
-            let Some((_, Payload::Bootloader(new))) = package.program(step.entry) else { continue };
-            let Some(bootloader) = &its.bootloader else { continue };
+            let Some((_, new)) = package.program(step.entry) else { continue };
+            let Some(bootloader) = its.bootloader.as_ref().filter(|_| new.is_bootloader()) else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
             match program_info(&mut session, bootloader.number) {
@@ -303,14 +303,14 @@ fn has(info: &DeviceInfo, entry: &Entry, crcs: [u32; 2]) -> bool {
 
 /// Whether the device has this bootloader. The CRC of a sealed one is not known here, and an application
 /// need not report any: then the version decides.
-fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &NewBootloader) -> bool {
+fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &Payload) -> bool {
     let Some(its) = info.bootloader else { return false };
     // One on trial has to be confirmed.
     let is_settled =
         its.running.is_none_or(|running| running.progress.state != shared_abi::renewal::State::Staged);
     let is_same = match (new, has.crc) {
-        (NewBootloader::Plain(_), Some(crc)) if crc != 0 => crc == new.crc(),
-        _ => its.version == new.version(),
+        (Payload::Bootloader(_), Some(crc)) if crc != 0 => crc == new.crc(),
+        _ => Some(its.version) == new.bootloader(),
     };
     is_settled && is_same
 }

@@ -6,9 +6,9 @@ use canopen::Address;
 use seal::access::right;
 use shared_abi::layout;
 
-use super::content::{refusal_number, Content};
 use super::dialect::is_data;
 use super::options::FlashOptions;
+use super::payload::{refusal_number, Payload};
 use super::steps::compare_target;
 use crate::advice::Advice;
 use crate::device::access::{security_of, told_challenge, Challenge};
@@ -53,27 +53,30 @@ enum Question<'f> {
 /// Those of [`Admission::ask`].
 pub(super) fn admit<'f>(
     session: &mut Session<'_>,
-    content: Content<'f>,
+    file: &'f Payload,
     dialect: Dialect,
     options: &FlashOptions,
 ) -> Result<Admission<'f>, Error> {
     let number = options.program;
-    let open = match content {
-        _ if options.force => vec![],
-        Content::Program(program) if is_data(dialect, number) => {
+    let open = match file {
+        // The renewal asks the bootloader itself.
+        file if options.force || file.is_bootloader() => vec![],
+        Payload::Program(program) if is_data(dialect, number) => {
             vec![Question::TakesOpen, Question::Place(program)]
         }
-        Content::Program(program) => vec![
+        Payload::Program(program) => vec![
             Question::TakesOpen,
             Question::Image(program),
             Question::Target(program),
             Question::Place(program),
         ],
-        Content::Sealed(file) => {
+        Payload::Sealed(file) => {
             vec![Question::Manifest(file), Question::TakesSealed(file), Question::Size(file)]
         }
+        Payload::Bootloader(_) => vec![],
     };
-    let is_sealed_in_blocks = matches!(content, Content::Sealed(_)) && options.blocks.is_some();
+    let is_sealed_in_blocks =
+        matches!(file, Payload::Sealed(_)) && !file.is_bootloader() && options.blocks.is_some();
     let mut admission = Admission { number, is_sealed_in_blocks, open };
     admission.ask(session, dialect)?;
     Ok(admission)
@@ -128,7 +131,10 @@ impl Question<'_> {
 }
 
 /// Checks that a device takes images that are not sealed; returns whether it has said so.
-fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
+///
+/// # Errors
+/// [`Error::SealedOnly`], and the errors of a [read](Session::read).
+pub(super) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
     match told_challenge(session)? {
         Some(challenge) if challenge.is_sealed() => {
             let roots = security_of(session, &challenge)?.roots;

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use canopen::program::{self, FlashError};
-use canopen::{Address, NodeId};
+use canopen::Address;
 
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen};
 use super::running::RunningUpdate;
@@ -14,14 +14,12 @@ use crate::device::{DeviceType, Session, Timing};
 /// How long the device may take for its answer; there are two attempts.
 const ANSWER: Duration = Duration::from_millis(500);
 
-/// Asks the device for its state after the update. `original` is the node-ID at the start of the
-/// update, and `crcs` the values that 1F56h may have with the
+/// Asks the device for its state after the update. `crcs` are the values that 1F56h may have with the
 /// file's program.
 pub(super) fn look(
     session: &mut Session<'_>,
     error: &Error,
     update: &RunningUpdate<'_>,
-    original: NodeId,
     number: u8,
     crcs: [u32; 2],
 ) -> DeviceAfterUpdate {
@@ -30,7 +28,7 @@ pub(super) fn look(
     if untouched || matches!(error, Error::Adapter(_)) {
         return unseen(DeviceAnswer::NotAsked);
     }
-    let current = session.node();
+    let (current, original) = (session.node(), update.original);
     let nodes = [current, original];
     for node in &nodes[..if current == original { 1 } else { 2 }] {
         let timing = Timing { sdo: ANSWER.min(session.timing().sdo), attempts: 2, ..*session.timing() };

@@ -1,38 +1,37 @@
 //! Step 3: the way of a device into its bootloader.
 
-use canopen::NodeId;
-
 use super::admission::Admission;
 use super::dialect;
 use super::event::Phase;
 use super::options::FlashOptions;
+use super::payload::Payload;
 use super::reach::Found;
 use super::running::RunningUpdate;
-use crate::device::{Dialect, Error, Session};
+use crate::device::{Error, Session};
 
-/// Brings the device into its bootloader, which answers what the application did not know. Returns the
-/// dialect of the bootloader.
+/// Brings the device into its bootloader, which answers what the application did not know.
 ///
 /// # Errors
 /// [`Error::NotAlone`], [`Error::NoBootloader`], and those of the [admission](Admission::ask). The program
 /// that was called back is started again, if the device still answers.
 pub(super) fn enter(
     session: &mut Session<'_>,
+    file: &Payload,
     found: Found,
     mut admission: Admission<'_>,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
-) -> Result<Dialect, Error> {
+) -> Result<(), Error> {
     match (options.alone, options.wait) {
         (false, _) => {}
         (true, false) => session.still_alone()?,
         (true, true) => session.ensure_alone()?,
     }
-    let (original, before) = (session.node(), session.now());
-    let dialect = dialect::of(found.dialect).enter(session, found.running, options, update)?;
+    let before = session.now();
+    update.dialect = dialect::procedure(file, found.dialect).enter(session, found, options, update)?;
     let is_ready = (|| {
         if !found.running.is_bootloader() {
-            admission.ask(session, dialect)?;
+            admission.ask(session, update.dialect)?;
         }
         match update.called {
             _ if !options.alone => Ok(()),
@@ -44,23 +43,17 @@ pub(super) fn enter(
         let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
         // The device belongs to the tool that commands it.
         if !is_lost && !session.is_commanded_since(before) {
-            start_again(session, dialect, original, program, update);
+            start_again(session, program, update);
         }
     }
-    is_ready.map(|()| dialect)
+    is_ready
 }
 
 /// Starts the program again that was called back for an update which does not take place. The reason
 /// for that stays the result, whether the program starts or not.
-fn start_again(
-    session: &mut Session<'_>,
-    dialect: Dialect,
-    original: NodeId,
-    program: u8,
-    update: &mut RunningUpdate<'_>,
-) {
+fn start_again(session: &mut Session<'_>, program: u8, update: &mut RunningUpdate<'_>) {
     update.tell(Phase::StartingAgain.into());
-    if let Ok(running) = dialect::of(dialect).start(session, original, program) {
+    if let Ok(running) = dialect::of(update.dialect).start(session, update.original, program) {
         update.tell(Phase::Started(running).into());
     }
 }

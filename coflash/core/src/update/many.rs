@@ -8,11 +8,11 @@ use std::sync::Arc;
 use canopen::frame::Channel;
 use canopen::{CobId, NodeId};
 
-use super::content::Payload;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Event, Note, Report, Warning};
-use super::flash::flash_program;
 use super::options::FlashOptions;
+use super::payload::Payload;
+use super::pipeline::flash;
 use crate::device::{Error, Session, Timing, Transfers};
 use coboot_can::{hub, Adapter, Gateway};
 
@@ -269,7 +269,7 @@ pub(crate) fn update(
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
     let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
-    let result = flash_program(session, &job.file, one, &mut |event| {
+    let result = flash(session, &job.file, one, &mut |event| {
         left = event.left().unwrap_or(left);
         tell(event);
     });

@@ -1,13 +1,12 @@
 //! From the bytes of a file to what a device gets.
 
 use std::path::Path;
-use std::sync::Arc;
 
+use seal::wire::BOOTLOADER;
 use shared_abi::layout::Layout;
 
-use super::content::Payload;
 use super::dialect::is_data;
-use super::new_bootloader::NewBootloader;
+use super::payload::Payload;
 use crate::device::Dialect;
 use crate::file::convert::{program_of, ConvertError, Options, Region};
 use crate::file::inspect::Inspection;
@@ -128,8 +127,8 @@ impl Reading {
             return self.sealed(bytes).map(only);
         }
         let format = self.format.or_else(|| Format::of(name, bytes));
-        if let Some(new) = NewBootloader::in_file(bytes, format).map_err(ContentFault::Bootloader)? {
-            return Ok(only(new.into()));
+        if let Some(new) = Payload::bootloader_in(bytes, format).map_err(ContentFault::Bootloader)? {
+            return Ok(only(new));
         }
         let convert = self.convert.region(self.region()?);
         let raw_address = self.address.or_else(|| convert.raw_address()).or_else(|| {
@@ -154,20 +153,18 @@ impl Reading {
             }
             _ => {}
         }
-        Ok(Loaded { payload: Arc::new(program).into(), left_out, notes, inspection })
+        Ok(Loaded { payload: program.into(), left_out, notes, inspection })
     }
 
     /// Reads a sealed image, which stays unchanged: only the keys of a device open it.
     fn sealed(&self, bytes: &[u8]) -> Result<Payload, ContentFault> {
         let image = carried(bytes.to_vec()).map_err(ContentFault::File)?.image;
-        if let Some(new) = NewBootloader::of_sealed(&image) {
-            return Ok(new.into());
+        let file = SealedFile::parse(image).map_err(ContentFault::Sealed)?;
+        let image = file.head().program();
+        if self.judging != Judging::Nothing && ![self.program, BOOTLOADER].contains(&image) {
+            return Err(ContentFault::Sealed(Refusal::Program { image, device: self.program }));
         }
-        let file = match self.judging {
-            Judging::Nothing => SealedFile::parse(image),
-            Judging::Whole | Judging::Handoff => SealedFile::for_program(image, self.program),
-        };
-        Ok(Arc::new(file.map_err(ContentFault::Sealed)?).into())
+        Ok(file.into())
     }
 
     /// The region of the program.

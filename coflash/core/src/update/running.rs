@@ -2,12 +2,14 @@
 
 use std::cell::RefCell;
 
+use canopen::NodeId;
+
 use super::device_after::DeviceState;
 use super::event::{Event, Note, Phase, Warning};
 use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
 use crate::device::session::Silence;
-use crate::device::Session;
+use crate::device::{Dialect, Session};
 
 /// Carries out `work` in a session that reports silence of the node as an event.
 pub(super) fn telling_silence<R>(
@@ -37,6 +39,10 @@ pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut
 
 /// A running update.
 pub(super) struct RunningUpdate<'t> {
+    /// The node at its start: a lift's bootloader has another one.
+    pub(super) original: NodeId,
+    /// The dialect of the bootloader, as far as it is known.
+    pub(super) dialect: Dialect,
     /// The state of the device so far.
     pub(super) state: DeviceState,
     /// The program that was called back to the bootloader for this update.
@@ -59,9 +65,11 @@ pub(super) struct RunningUpdate<'t> {
 }
 
 impl<'t> RunningUpdate<'t> {
-    /// An update that has not done anything yet.
-    pub(super) fn new(tell: &'t mut dyn FnMut(Event)) -> Self {
+    /// An update of this node that has not done anything yet.
+    pub(super) fn new(original: NodeId, tell: &'t mut dyn FnMut(Event)) -> Self {
         Self {
+            original,
+            dialect: Dialect::Block,
             state: DeviceState::Untouched,
             called: None,
             touched: false,
@@ -86,7 +94,7 @@ impl<'t> RunningUpdate<'t> {
 
     /// Records that the device has refused the erase.
     pub(super) fn erases_not(&mut self) {
-        if !self.wrote {
+        if self.state == DeviceState::Erased && !self.wrote {
             self.state = self.resting;
         }
     }

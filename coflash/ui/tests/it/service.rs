@@ -49,9 +49,9 @@ fn device(node: u8, product: u32) -> (Fake, Arc<Mutex<u32>>) {
 /// The package of these programs in a recipe, with one image.
 fn package(folder: &Folder, programs: &str) -> Package {
     folder.write("app.hex", HEX);
-    let Recipe { name, release, parts, .. } =
-        Recipe::read(&format!("name = 'Press 4'\n{programs}"), folder).unwrap();
-    Package::parse(&make(name, release, &parts, &[]).unwrap()).unwrap()
+    let recipe = Recipe::parse(&format!("name = 'Press 4'\n{programs}"), folder).unwrap();
+    let parts = recipe.parts().unwrap();
+    Package::parse(&make(recipe.name, recipe.release, &parts, &[]).unwrap()).unwrap()
 }
 
 const DRIVES: &str =
@@ -506,20 +506,19 @@ fn a_locked_device_gets_its_password_from_the_page_and_nothing_keeps_it() {
     assert!(refused.status == 400 && !refused.body.contains("PLANTED"), "{}", refused.body);
 }
 
-/// A job file does what a package does: its devices with the same settings get one program together.
+/// A job file does what a package does.
 #[test]
 fn a_job_file_is_a_machine() {
     let folder = kit::folder!("service-job");
-    folder.write("app.hex", HEX);
-    let job = "image = 'app.hex'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\n[[device]]\nnode = 7\ntrial-run = false\n";
-    let Recipe { parts, images, .. } = Recipe::of_job(job, &folder).unwrap();
-    assert_eq!(images, [folder.join("app.hex"), folder.join("app.hex")]);
-    let entries: Vec<_> = parts.iter().map(|part| &part.entry).collect();
-    assert_eq!((&entries[0].nodes[..], entries[0].trial_run), (&[5, 6][..], true));
+    let job = "[[program]]\nimage = 'app.hex'\nnodes = [5, 6]\n\
+               [[program]]\nname = 'other'\nimage = 'app.hex'\nnodes = [7]\ntrial-run = false\n";
+    let package = package(&folder, job);
+    let entries: Vec<_> = package.programs().map(|(entry, _)| entry).collect();
+    assert_eq!(
+        (entries[0].name.as_str(), &entries[0].nodes[..], entries[0].trial_run),
+        ("app", &[5, 6][..], true)
+    );
     assert_eq!((&entries[1].nodes[..], entries[1].trial_run), (&[7][..], false));
-    let names: Vec<_> = entries.iter().map(|entry| entry.name.as_str()).collect();
-    assert_eq!(names, ["app", "app (2)"]);
-    let package = Package::parse(&make(None, None, &parts, &[]).unwrap()).unwrap();
     let (bus, _server) = kit::fake::serve(Bus([5, 6, 7].map(|node| device(node, 1234).0).into()));
     let service = Service::new(package, "press.toml".as_ref(), Origin::Job, &folder.join("reports")).unwrap();
     let ui = Ui::with(|options| (options.bus, options.service) = (Some(bus), Some(service)));
@@ -530,18 +529,4 @@ fn a_job_file_is_a_machine() {
     assert_eq!(confirm(&ui, &plan, &[5, 6, 7]).status, 200);
     let end = ended(&ui);
     assert_eq!(rows(&end), [(5, "state-updated"), (6, "state-updated"), (7, "state-updated")], "{end}");
-    for (more, words) in [
-        ("start = false\n", "device 1: each program of a machine is started"),
-        ("lss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n", "device 1: a machine has node-IDs"),
-        ("check-target = true\n", "device 1: the file does not say for which device it is"),
-        ("image = 'none.hex'\n", "none.hex"),
-    ] {
-        let fault = Recipe::of_job(
-            &format!("[[device]]\nnode = 5\nimage = 'app.hex'\n{more}")
-                .replace("image = 'app.hex'\nimage", "image"),
-            &folder,
-        );
-        let words_of = fault.unwrap_err().to_string();
-        assert!(words_of.contains(words), "{words_of}");
-    }
 }

@@ -152,9 +152,10 @@ fn a_job_file_serves_its_devices_and_reports() {
     coflash.done(&["convert", "program.bin", "program.blk", "-I", "binary", "--board", "stm32f407g-disc1"]);
     folder.write(
         "job.toml",
-        b"image = 'program.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nstart = false\n\
-          [[device]]\nlss = { vendor = 0, product = 0, revision = 0x10000, serial = 3 }\nnode = 20\nstart = false\n\
-          [[device]]\nnode = 99\n",
+        b"[[program]]\nimage = 'program.blk'\nnodes = [5, 99]\n\
+          [[program]]\nimage = 'program.blk'\nnodes = [6]\nstart = false\n\
+          [[program]]\nimage = 'program.blk'\nnodes = [20]\nstart = false\n\
+          lss = { vendor = 0, product = 0, revision = 0x10000, serial = 3 }\n",
     );
     let words = ["flash", "--job", "job.toml", "--report", "report.json", "--sdo-timeout", "200"];
     let done = coflash.run(&words);

@@ -267,7 +267,8 @@ fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
     );
     folder.write(
         "job.toml",
-        b"image = \"program.bin\"\n[[device]]\nlss = { vendor = 0, product = 0x1234, revision = 0x10000, serial = 77 }\nnode = 23\n",
+        b"[[program]]\nimage = 'program.bin'\nnodes = [23]\n\
+          lss = { vendor = 0, product = 0x1234, revision = 0x10000, serial = 77 }\n",
     );
     let coflash = Coflash::new(&folder, &nodes);
     let options = &FLASH[2..];

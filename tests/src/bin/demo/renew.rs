@@ -1,7 +1,5 @@
 //! The renewal of the bootloader as a demonstration: `cargo xtask demo --renew`.
 
-use std::sync::Arc;
-
 use bsp::can::BitTiming;
 use canopen::program::{ProgramControl, ProgramStart, DEVICE_STATE, STATE_PROGRAM_START};
 use canopen::Address;
@@ -11,7 +9,7 @@ use coboot_tests::renewal::{image_of, with_crc};
 use coboot_tests::sealed_board;
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::read::{read, Firmware, Format};
-use coflash_core::update::{renew, Event, FlashOptions, NewBootloader};
+use coflash_core::update::{flash, Event, FlashOptions, Payload};
 use emulator::machine::{Cut, FlashCut};
 
 use crate::steps::{chapter, convert, install, introduce, print_line, Outcome};
@@ -71,18 +69,17 @@ pub fn tell(bench: &mut Bench) -> Outcome<()> {
     }
 }
 
-fn bootloader(bytes: Vec<u8>) -> Outcome<NewBootloader> {
+fn bootloader(bytes: Vec<u8>) -> Outcome<Payload> {
     let Firmware::Image(image) = read(&bytes, Some(Format::Raw), Some(0))? else {
         return Err("a raw file is an image".into());
     };
-    let image = RamImage::find(&image).ok_or("there is no RAM image")?;
-    Ok(NewBootloader::Plain(Arc::new(image)))
+    Ok(RamImage::find(&image).ok_or("there is no RAM image")?.into())
 }
 
 /// The whole procedure of the tool, printed step by step.
-fn renewed(bench: &mut Bench, new: &NewBootloader) -> Outcome<()> {
+fn renewed(bench: &mut Bench, new: &Payload) -> Outcome<()> {
     let clock = bench.clock();
-    let outcome = renew(&mut bench.session(), new, &FlashOptions::default(), &mut |event| match event {
+    let outcome = flash(&mut bench.session(), new, &FlashOptions::default(), &mut |event| match event {
         Event::Progress { .. } | Event::Done(_) => {}
         event => print_line(clock.get(), &event.to_string()),
     });

@@ -12,17 +12,18 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::advice::Advice;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
-use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
+use crate::device::{Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile, FRAMING};
 use crate::file::checksum::Checksum;
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
 use crate::file::sealed::SealedFile;
-use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, RepeatReason, Retry, Warning};
 use crate::update::judge::{judge, Judgement};
 use crate::update::options::FlashOptions;
+use crate::update::payload::Payload;
+use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::{steps, trial};
 use coboot_can::adapter::Met;
@@ -40,11 +41,11 @@ impl Procedure for Block {
     fn enter(
         &self,
         session: &mut Session<'_>,
-        running: DeviceType,
+        found: Found,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, running, Dialect::Block, options, update)
+        enter_by_call(session, found, options, update)
     }
 
     /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
@@ -54,7 +55,7 @@ impl Procedure for Block {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: Content<'_>,
+        file: &Payload,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
@@ -64,8 +65,11 @@ impl Procedure for Block {
             return Err(NOT_TOGETHER);
         }
         let (file, is_sealed) = match file {
-            Content::Program(program) => (BlockFile::of(program), false),
-            Content::Sealed(sealed) => {
+            Payload::Program(program) => (BlockFile::of(program), false),
+            Payload::Bootloader(image) => {
+                return cia302::download(session, image.bytes(), crcs, options, update)
+            }
+            Payload::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
                     None => return cia302::download(session, sealed.bytes(), crcs, options, update),
@@ -85,19 +89,19 @@ impl Procedure for Block {
         let (repeats, took) = sent?;
         if is_sealed {
             update.state = DeviceState::Written;
-            return Ok(Downloaded { repeats, took, released: None });
+            return Ok(Downloaded { repeats, took, released: None, renewal: None });
         }
         update.state = DeviceState::Unreleased;
         if !options.start {
             update.tell(Phase::NotReleased.into());
-            return Ok(Downloaded { repeats, took, released: Some(false) });
+            return Ok(Downloaded { repeats, took, released: Some(false), renewal: None });
         }
         if options.trial_run {
             trial::run(session, options, update)?;
         }
         steps::release(session, number, &mut |event| update.tell(event))?;
         update.state = DeviceState::Released;
-        Ok(Downloaded { repeats, took, released: Some(true) })
+        Ok(Downloaded { repeats, took, released: Some(true), renewal: None })
     }
 }
 

@@ -8,11 +8,12 @@ use super::encode;
 use super::procedure::{Downloaded, Procedure};
 use super::whole::{self, Whole};
 use crate::device::error::absent;
-use crate::device::{DeviceType, Dialect, Error, Session};
-use crate::update::content::{Content, Encoder};
+use crate::device::{Dialect, Doing, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
 use crate::update::options::FlashOptions;
+use crate::update::payload::{Encoder, Payload};
+use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::{call_back, clear_and_wait, running_program};
 
@@ -31,11 +32,11 @@ impl Procedure for Cia302 {
     fn enter(
         &self,
         session: &mut Session<'_>,
-        running: DeviceType,
+        found: Found,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        if !running.is_bootloader() {
+        if !found.running.is_bootloader() {
             update.state = DeviceState::Called;
             stop_program(session, options.program, update)?;
         }
@@ -46,7 +47,7 @@ impl Procedure for Cia302 {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: Content<'_>,
+        file: &Payload,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
@@ -66,8 +67,8 @@ pub(super) fn download(
     let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
         clear_and_wait(session, number, &mut |event| update.tell(event))
     };
-    let whole = Whole { content, crcs, prepare: &prepare, status: whole::status };
-    whole::download(session, &whole, options, update)
+    let whole = Whole { number, content, doing: Doing::Program, prepare: &prepare, status: whole::status };
+    whole::download(session, &whole, crcs, options, update)
 }
 
 /// Calls the bootloader of a device that only supports CiA 302-3 with STOP: the bootloader then

@@ -11,9 +11,10 @@ use super::restart::{arrived, reset_program};
 use super::whole::{self, idle, Said, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
-use crate::update::content::Content;
 use crate::update::event::Note;
 use crate::update::options::FlashOptions;
+use crate::update::payload::Payload;
+use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::await_application;
 
@@ -31,17 +32,17 @@ impl Procedure for EsAcademy {
     fn enter(
         &self,
         session: &mut Session<'_>,
-        running: DeviceType,
+        found: Found,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, running, Dialect::EsAcademy, options, update)
+        enter_by_call(session, found, options, update)
     }
 
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: Content<'_>,
+        file: &Payload,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
@@ -52,9 +53,9 @@ impl Procedure for EsAcademy {
             }
             Ok(())
         };
-        let crcs = file.crcs();
-        let whole = Whole { content: &content, crcs, prepare: &prepare, status };
-        whole::download(session, &whole, options, update)
+        let (number, doing) = (options.program, Doing::Program);
+        let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
+        whole::download(session, &whole, file.crcs(), options, update)
     }
 
     /// The password is optional; without it, the download alone must be sufficient. That of a program
@@ -89,12 +90,12 @@ impl Procedure for EsAcademy {
 }
 
 /// The result of the download, from 1F57h if the device has it, otherwise from 1001h.
-fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
+fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => {}
         // A device that has the whole program may restart at once.
         Err(Error::NoAnswer { .. }) => return Ok(None),
-        Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number),
+        Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number, doing),
         Err(error) => return Err(error),
     }
     let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {

@@ -14,11 +14,12 @@ use crate::device::flying_master::{self, Asked};
 use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
-use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, Warning};
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
+use crate::update::payload::Payload;
+use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 
 /// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
@@ -39,7 +40,7 @@ impl Procedure for Lift {
     fn enter(
         &self,
         session: &mut Session<'_>,
-        running: DeviceType,
+        found: Found,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
@@ -49,7 +50,7 @@ impl Procedure for Lift {
         }
         update.tell(Note::Dialect { dialect: Dialect::Lift }.into());
         update.tell(Note::Nameplate(Box::new(nameplate(session)?)).into());
-        check(session, running, options.unlock)?;
+        check(session, found.running, options.unlock)?;
         if options.mastership {
             match flying_master::ask(session)? {
                 Asked::Nobody => {}
@@ -67,15 +68,16 @@ impl Procedure for Lift {
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: Content<'_>,
+        file: &Payload,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (content, crcs) = (file.encoded(raw), file.crcs());
+        let content = file.encoded(raw);
         // The device is already unlocked; the download overwrites the old program.
         let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
-        let whole = Whole { content: &content, crcs, prepare: &prepare, status: whole::status };
-        whole::download(session, &whole, options, update)
+        let (number, doing, status) = (options.program, Doing::Program, whole::status);
+        let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
+        whole::download(session, &whole, file.crcs(), options, update)
     }
 
     fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, _: u8) -> Result<bool, Error> {
@@ -230,7 +232,7 @@ pub fn read_locked(
     }
     let original = session.node();
     check(session, running, password)?;
-    unlock_bootloader(session, password, &mut RunningUpdate::new(tell))?;
+    unlock_bootloader(session, password, &mut RunningUpdate::new(original, tell))?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
         let restarted = reset_program(session, LIFT_PROGRAM);

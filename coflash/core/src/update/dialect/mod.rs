@@ -9,10 +9,12 @@
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
-//! `raw` and `hex` are one procedure with two encoders. To add a dialect, add a file that implements
+//! `raw` and `hex` are one procedure with two encoders. The renewal of a bootloader is one more, in every
+//! dialect. To add a dialect, add a file that implements
 //! `Procedure` and a line in `of`.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
+use super::payload::Payload;
 use crate::device::Dialect;
 
 mod block;
@@ -21,6 +23,7 @@ mod encode;
 mod esacademy;
 mod lift;
 mod procedure;
+mod renew;
 mod restart;
 mod whole;
 
@@ -35,7 +38,16 @@ pub const fn is_data(dialect: Dialect, program: u8) -> bool {
     matches!(dialect, Dialect::Lift) && program != lift::LIFT_PROGRAM
 }
 
-/// The procedure of this dialect.
+/// The procedure for this payload in this dialect.
+pub(super) fn procedure(file: &Payload, dialect: Dialect) -> &'static dyn Procedure {
+    if file.is_bootloader() {
+        &renew::Renew
+    } else {
+        of(dialect)
+    }
+}
+
+/// The procedure of this dialect for a program.
 pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
     match dialect {
         Dialect::Block => &block::Block,

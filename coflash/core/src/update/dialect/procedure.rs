@@ -5,14 +5,16 @@ use std::time::Duration;
 use canopen::NodeId;
 
 use crate::device::{DeviceType, Dialect, Error, Session};
-use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
 use crate::update::options::FlashOptions;
+use crate::update::payload::Payload;
+use crate::update::reach::Found;
+use crate::update::renewal::Renewal;
 use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
-/// The parts of an update that each dialect implements, in their order.
+/// The parts of an update that each dialect and the renewal of a bootloader implement, in their order.
 pub(in crate::update) trait Procedure {
     /// Step 3: makes the bootloader run. Returns the dialect of the bootloader, which may report
     /// more than the application did.
@@ -22,19 +24,20 @@ pub(in crate::update) trait Procedure {
     fn enter(
         &self,
         session: &mut Session<'_>,
-        running: DeviceType,
+        found: Found,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error>;
 
-    /// Steps 4 to 14: afterwards the program is in the device and starts at the next reset.
+    /// Steps 4 to 14: afterwards the program is in the device and starts at the next reset, or its bootloader
+    /// is renewed.
     ///
     /// # Errors
     /// The device's refusal.
     fn download(
         &self,
         session: &mut Session<'_>,
-        file: Content<'_>,
+        file: &Payload,
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error>;
@@ -68,29 +71,39 @@ pub(in crate::update) struct Downloaded {
     pub(in crate::update) took: Duration,
     /// Whether it is released for autostart; `None` in a dialect without a release.
     pub(in crate::update) released: Option<bool>,
+    /// The results of a renewal, after which the program runs again if it did before.
+    pub(in crate::update) renewal: Option<Renewal>,
 }
 
-/// Calls an application back with the call of coboot and SYS TEC. Returns the bootloader's dialect:
-/// the user's choice, otherwise the dialect of its device type, otherwise `found`.
+/// [`call_back`], with a note of the dialect.
 pub(super) fn enter_by_call(
     session: &mut Session<'_>,
-    running: DeviceType,
-    found: Dialect,
+    found: Found,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
-    let mut dialect = found;
-    if !running.is_bootloader() {
-        let program = steps::running_program(session, options.program)?;
-        update.state = DeviceState::Called;
-        update.called = Some(program.unwrap_or(steps::CALL_BACK));
-        update.tell(Phase::CallingBack.into());
-        let running = steps::call_back(session)?;
-        update.tell(Phase::InBootloader.into());
-        if options.dialect.is_none() {
-            dialect = Dialect::of_bootloader(running, session.node()).unwrap_or(found);
-        }
-    }
+    let dialect = call_back(session, found, options, update)?;
     update.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
+}
+
+/// Calls an application back with the call of coboot and SYS TEC. Returns the bootloader's dialect:
+/// the user's choice, otherwise the dialect of its device type, otherwise what was `found`.
+pub(super) fn call_back(
+    session: &mut Session<'_>,
+    found: Found,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<Dialect, Error> {
+    if found.running.is_bootloader() {
+        return Ok(found.dialect);
+    }
+    let program = steps::running_program(session, options.program)?;
+    update.state = DeviceState::Called;
+    update.called = Some(program.unwrap_or(steps::CALL_BACK));
+    update.tell(Phase::CallingBack.into());
+    let running = steps::call_back(session)?;
+    update.tell(Phase::InBootloader.into());
+    let its = Dialect::of_bootloader(running, session.node());
+    Ok(options.dialect.or(its).unwrap_or(found.dialect))
 }

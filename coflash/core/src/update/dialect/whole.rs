@@ -24,52 +24,58 @@ pub(super) type Said = Option<(FlashError, u16)>;
 
 /// The data to send, and the dialect's actions around the transfer.
 pub(super) struct Whole<'w> {
+    /// The program number: the sub-index of 1F50h and 1F57h.
+    pub(super) number: u8,
     /// All that is sent.
     pub(super) content: &'w [u8],
-    /// The CRC of the program, as the device may compute it.
-    pub(super) crcs: [u32; 2],
+    /// The word for it.
+    pub(super) doing: Doing,
     /// The action at the start of each attempt.
     pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut RunningUpdate<'_>) -> Result<(), Error>,
     /// Reads the device's result of the download.
-    pub(super) status: fn(&mut Session<'_>, u8) -> Result<Said, Error>,
+    pub(super) status: fn(&mut Session<'_>, u8, Doing) -> Result<Said, Error>,
 }
 
-/// Steps 4 to 9 in one download.
+/// Steps 4 to 9 in one download of a program; `crcs` are its CRCs, as the device may compute them.
 ///
 /// # Errors
 /// The device's refusal.
 pub(super) fn download(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
+    crcs: [u32; 2],
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
     let began = session.now();
+    let before = steps::told_before(session, whole.number)?;
+    update.erases(before);
     let repeats = send(session, whole, options, update)?;
     let took = session.now().saturating_sub(began);
     update.state = DeviceState::Written;
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
-        steps::verify(session, options.program, whole.crcs, &mut |event| update.tell(event))?;
+        steps::verify(session, whole.number, crcs, &mut |event| update.tell(event))?;
     }
-    Ok(Downloaded { repeats, took, released: None })
+    Ok(Downloaded { repeats, took, released: None, renewal: None })
 }
 
-/// Sends the program, with the preparation before each attempt; returns the number of repetitions.
-fn send(
+/// Sends it, with the preparation before each attempt; returns the number of repetitions.
+///
+/// # Errors
+/// The device's refusal.
+pub(super) fn send(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
-    let at = Address::new(program::PROGRAM_DATA, options.program);
-    let content = whole.content;
+    let Whole { number, content, doing, .. } = *whole;
+    let at = Address::new(program::PROGRAM_DATA, number);
     let total = content.len();
     let mut repeat = 0;
     loop {
-        let before = if repeat == 0 { steps::told_before(session, options.program)? } else { None };
-        update.erases(before);
         if let Err(error) = (whole.prepare)(session, update) {
             // A refused password erases nothing, and neither does a refused command.
             if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
@@ -86,7 +92,7 @@ fn send(
             update.postponed &= part == 0;
             update.tell(Event::Progress { done: part as usize, total });
         };
-        let sent = long.write(at, content, Doing::Program, &mut progress);
+        let sent = long.write(at, content, doing, &mut progress);
         let transfers = long.transfers();
         session.transfer_by(transfers);
         // Data without an answer may have arrived.
@@ -94,8 +100,8 @@ fn send(
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }
-        let status = (whole.status)(session, options.program)?;
-        let (why, error) = match judge(sent, status, Doing::Program) {
+        let status = (whole.status)(session, number, doing)?;
+        let (why, error) = match judge(sent, status, doing) {
             Judgement::Good => return Ok(repeat),
             Judgement::Bad { why, error } => (why, error),
         };
@@ -113,19 +119,19 @@ fn send(
 }
 
 /// The result of the download in 1F57h; `None` if the device does not have this object.
-pub(super) fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
+pub(super) fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
         Ok(_) | Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => {
-            idle(session, number)
+            idle(session, number, doing)
         }
         Err(error) => Err(error),
     }
 }
 
 /// The value of 1F57h when it is no longer busy.
-pub(super) fn idle(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
-    let status = session.await_idle(number, Doing::Program)?;
+pub(super) fn idle(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
+    let status = session.await_idle(number, doing)?;
     Ok(status.error.map(|error| (error, status.detail)))
 }
 

@@ -11,27 +11,27 @@ use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::raw;
 use coflash_core::update::event::{Phase, Warning};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
-use coflash_core::update::{renew, DeviceState, Event, FlashOptions, NewBootloader, Renewal};
+use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Renewal};
 use coflash_core::Error;
 use shared_abi::ram_image::Version;
 
 use kit::fake::renewal::*;
 use kit::fake::{Bus, Fake, APPLICATION, BOOTLOADER, NODE};
 
-fn new() -> NewBootloader {
+fn new() -> Payload {
     let image = raw::read(&image(NEW), Some(0x0801_0000)).unwrap();
-    NewBootloader::Plain(Arc::new(RamImage::find(&image).unwrap()))
+    RamImage::find(&image).unwrap().into()
 }
 
 fn run_with(fake: &mut Fake, options: &FlashOptions) -> (Result<Renewal, Error>, Vec<Event>) {
     let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
-    let result = renew(&mut session, &new(), options, &mut |event| {
-        if !matches!(event, Event::Progress { .. }) {
+    let result = flash(&mut session, new(), options, &mut |event| {
+        if !matches!(event, Event::Progress { .. } | Event::Done(_)) {
             events.push(event);
         }
     });
-    (result, events)
+    (result.map(|report| report.renewal.unwrap()), events)
 }
 
 fn run(fake: &mut Fake) -> (Result<Renewal, Error>, Vec<Event>) {
@@ -140,7 +140,7 @@ fn a_trial_of_a_longer_time_than_usual_is_no_endless_wait() {
     let mut fake = deaf();
     let timing = Timing::default().boot(Duration::from_secs(615));
     let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), timing);
-    let result = renew(&mut session, &new(), &FlashOptions::default(), &mut |_| {});
+    let result = flash(&mut session, new(), &FlashOptions::default(), &mut |_| {});
     assert!(matches!(result, Err(Error::RenewalFailed { .. })), "{result:?}");
     assert_eq!(fake.running, Some(APPLICATION), "the program runs again");
 }

@@ -1,0 +1,115 @@
+//! The update of a device: steps 2 to 15 of the procedure in the manual (L-1112d_10, "Prinzipieller
+//! Ablauf").
+//!
+//! Step 1, making the program, is [`convert`](mod@crate::file::convert); the dialect cuts it in blocks. All
+//! checks that are possible before the device is changed are made there and in `admission`.
+
+use super::admission::admit;
+use super::aftermath::look;
+use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
+use super::dialect::{self, Downloaded};
+use super::entry::enter;
+use super::event::{Done, Event, Phase, Report};
+use super::options::FlashOptions;
+use super::payload::Payload;
+use super::reach::{find, reach};
+use super::renewal::Renewal;
+use super::running::{give_back, telling_silence, RunningUpdate};
+use super::steps::compare_crc;
+use super::watch;
+use crate::device::{Dialect, Error, Session};
+
+/// Updates a device: detects what runs there, calls the bootloader, and gives it the program, the sealed
+/// image, which is sent unchanged, or the bootloader.
+///
+/// A program is erased, sent, compared by its CRC, tried, released for autostart and started, as far as
+/// the dialect of the device has these steps. A bootloader runs on trial, is confirmed and installed; the
+/// program stays, and is started again if it ran before.
+///
+/// `tell` gets the events; the last event is always [`Event::Done`].
+///
+/// An update that was interrupted at any point can be started again at once.
+///
+/// # Errors
+/// The first step that fails ends the procedure. Until a program is released for autostart, the device
+/// comes up in the bootloader; until a bootloader is confirmed, the old one comes back by itself.
+pub fn flash(
+    session: &mut Session<'_>,
+    file: impl Into<Payload>,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    let file = &file.into();
+    let (result, node, transfers) = telling_silence(session, tell, |session, tell| {
+        let mut update = RunningUpdate::new(session.node(), tell);
+        let result = procedure(session, file, options, &mut update);
+        let left = match &result {
+            Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
+            Err(error) => look(session, error, &update, options.program, file.crcs()),
+        };
+        if let Some(taken) = update.mastership.take() {
+            give_back(session, taken, &mut |event| update.tell(event));
+        }
+        update.tell(Event::Done(Box::new(Done::new(left, &result))));
+        (result, session.node(), session.transfers())
+    });
+    // The session may have followed the device to another node-ID.
+    session.talk_to(node);
+    session.transfer_by(transfers);
+    result
+}
+
+/// [`flash`] without the actions that are necessary after success and failure alike.
+fn procedure(
+    session: &mut Session<'_>,
+    file: &Payload,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<Report, Error> {
+    let began = session.now();
+    reach(session, options, update, |session, update| {
+        let found = find(session, options, update)?;
+        let admission = admit(session, file, found.dialect, options)?;
+        enter(session, file, found, admission, options, update)
+    })?;
+    let dialect = update.dialect;
+    let its = dialect::procedure(file, dialect);
+    if dialect != Dialect::Block {
+        session.leave_group();
+    }
+    let downloaded = its.download(session, file, options, update)?;
+    let Downloaded { repeats, took: transfer, released, renewal } = downloaded;
+    let running = match renewal {
+        Some(renewal) => renewal.running,
+        None if options.start => {
+            let time = watch::time(session, dialect, options)?;
+            update.tell(Phase::Starting.into());
+            let starts = session.now();
+            let running = its.start(session, update.original, options.program)?;
+            watch::watch(session, starts, time)?;
+            update.tell(Phase::Started(running).into());
+            Some(running)
+        }
+        None => None,
+    };
+    // 1F56h of a program is not that of a new bootloader.
+    if options.verify && renewal.is_none() {
+        let crc = compare_crc(session, options.program, file.crcs())?;
+        update.tell(Phase::VerifiedAgain { crc }.into());
+    }
+    let took = session.now().saturating_sub(began);
+    let (program_size, program_crc) = (file.size(), file.crc());
+    let transfers = session.transfers();
+    Ok(Report {
+        program_size,
+        program_crc,
+        repeats,
+        took,
+        transfer,
+        transfers,
+        running,
+        released,
+        dialect,
+        renewal: renewal.map(|renewal| Renewal { took, ..renewal }),
+    })
+}
