@@ -522,9 +522,10 @@ const BY_FACTS_OF: [&str; 7] = [
     "bootloader-sealed-writes-flash",
 ];
 
-/// Each image on each resident part, as the running bootloader and the resident part judge its header.
+/// Each image on each resident part, as the running bootloader and the resident part judge its header. Without staging the
+/// last two rows are the same.
 #[test]
-#[cfg_attr(not(split_map), ignore = "needs the split map")]
+#[cfg_attr(not(staging), ignore = "needs a region for staging")]
 fn an_image_is_for_the_resident_parts_with_its_facts_alone() {
     let board = firmware::board();
     let rows = BY_FACTS_OF.iter().enumerate();
