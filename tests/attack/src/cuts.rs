@@ -1,5 +1,5 @@
-//! Proof by power cut: a device, what a host does to it, and what it does after a cut. The power is cut in each
-//! flash operation of both, in every way.
+//! Proof by power cut: a device, what a host does to it, and what it does after a cut. The power is
+//! cut in each flash operation of both, in every way.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -25,7 +25,8 @@ use crate::script::{renewal, whole};
 
 /// The number of violations that a report describes.
 const TOLD: usize = 10;
-/// How many times a device starts and is looked at: bits between 0 and 1 read differently each time.
+/// How many times a device starts and is looked at: bits between 0 and 1 read differently each
+/// time.
 const LOOKS: usize = 4;
 
 /// The ways in which an operation is cut.
@@ -47,8 +48,8 @@ pub struct At {
     pub way: usize,
 }
 
-/// A cut in a scenario, and possibly another one in the recovery; `board:` before it for the real firmware.
-/// Written as `update:37:torn` or `board:update:37:torn:12:after`.
+/// A cut in a scenario, and possibly another one in the recovery; `board:` before it for the real
+/// firmware. Written as `update:37:torn` or `board:update:37:torn:12:after`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
     pub is_board: bool,
@@ -116,8 +117,8 @@ pub struct Report {
     /// What was found after the power returned, with the counts.
     pub outcomes: BTreeMap<&'static str, u64>,
     /// For each way, a letter for each operation: what was found after a cut there. `B` bootloader,
-    /// `O` old program, `N` new program, `!` a violation, `=` a flash that was looked at already, `.`
-    /// not cut. The model has none.
+    /// `O` old program, `N` new program, `!` a violation, `=` a flash that was looked at already,
+    /// `.` not cut. The model has none.
     pub map: BTreeMap<&'static str, Vec<u8>>,
     /// The number of points with a violation.
     pub violations: u64,
@@ -162,8 +163,8 @@ const NEW_LABELLED: Content = Content::Program(1, Extent::Bytes(0x210));
 const OLD_2: Content = Content::Program(2, Extent::Bytes(0xD8));
 const NEW_2: Content = Content::Program(2, Extent::Bytes(0xE0));
 
-/// What is there in the end: program 1 and program 2, released; whether program 1 starts by itself; and the
-/// node-IDs that may be stored.
+/// What is there in the end: program 1 and program 2, released; whether program 1 starts by itself;
+/// and the node-IDs that may be stored.
 #[derive(Clone, Copy)]
 struct End(Option<Content>, Option<Content>, bool, &'static [u8]);
 
@@ -509,8 +510,8 @@ pub static SCENARIOS: &[Scenario] = &[
 /// How much of a scenario is cut.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Cuts {
-    /// Some operations, drawn by this seed, in every way; and some of the recovery, in one way that changes
-    /// from operation to operation.
+    /// Some operations, drawn by this seed, in every way; and some of the recovery, in one way that
+    /// changes from operation to operation.
     Sample(u64),
     /// Every operation, and every one of the recovery.
     EveryOperation,
@@ -634,7 +635,8 @@ impl Proof<'_> {
         Err("there is no such operation".into())
     }
 
-    /// What is found after a cut, several times. With the first cut nothing is excused by bits between 0 and 1.
+    /// What is found after a cut, several times. With the first cut nothing is excused by bits
+    /// between 0 and 1.
     fn look(&self, mut model: Model, mut history: History) -> Result<State, String> {
         let mut seen = carried_out(|| model.look())?;
         for look in 0..LOOKS {
@@ -753,8 +755,8 @@ impl Proof<'_> {
         self.recover(&State { flash: model.flash(), history: trace.history.clone(), outcome: "" })?;
         let next = AtomicU32::new(1);
         let total = Mutex::new(Report { operations: trace.operations.into(), ..Report::default() });
-        // A run that must stop early processes the operations in order, so that it always reports the
-        // same first violation.
+        // A run that must stop early processes the operations in order, so that it always reports
+        // the same first violation.
         let threads =
             if violations == 1 { 1 } else { std::thread::available_parallelism().map_or(1, usize::from) };
         std::thread::scope(|scope| {

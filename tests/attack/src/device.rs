@@ -123,7 +123,8 @@ pub struct Program {
 pub struct Partial {
     /// The CRC of its control block.
     pub id: u32,
-    /// So many bytes are in flash, as the device says; more than the flash of the program has: no place in it.
+    /// So many bytes are in flash, as the device says; more than the flash of the program has: no
+    /// place in it.
     pub len: usize,
     /// The CRC of these bytes in flash.
     pub crc: u32,
@@ -146,8 +147,8 @@ pub struct Seen {
     pub is_staged: bool,
     /// The programs, number 1 first.
     pub programs: Vec<Program>,
-    /// The program that starts after a power-on, and whether it is whole and released. (Program 1 alone starts by
-    /// itself.)
+    /// The program that starts after a power-on, and whether it is whole and released. (Program 1
+    /// alone starts by itself.)
     pub starting: Option<(u8, bool)>,
     /// The stored node-ID and bit rate.
     pub node: NodeParameters,

@@ -104,7 +104,8 @@ pub enum Flaw {
     Head(u8),
     /// Signed by a stranger, with a certificate of his own.
     Stranger,
-    /// Signed by the owner, with these changes in the manifest, or in the payload. It may be accepted.
+    /// Signed by the owner, with these changes in the manifest, or in the payload. It may be
+    /// accepted.
     Signed(Changes, bool),
 }
 

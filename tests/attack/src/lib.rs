@@ -12,9 +12,9 @@
 //! | `mistakes` | the same with a seeded mistake, which the rules must find |
 //! | `sealed` | keys, and sealed images that can be changed |
 //!
-//! The same seed gives the same actions, and a fuzzer's bytes are a seed, too. A seed that breaks a rule is shortened
-//! and printed. Another device is another [`Device`](device::Device); another rule is one more line of
-//! [`RULES`](rules::RULES).
+//! The same seed gives the same actions, and a fuzzer's bytes are a seed, too. A seed that breaks a
+//! rule is shortened and printed. Another device is another [`Device`](device::Device); another
+//! rule is one more line of [`RULES`](rules::RULES).
 
 #![allow(missing_docs, reason = "names say it")]
 #![forbid(unsafe_code)]

@@ -52,7 +52,8 @@ fn renews(setup: &Setup) -> bool {
     setup.profile.extras.bootloader.is_some()
 }
 
-/// The boot stage's choice on a device whose bootloader is whole. Program 1 starts by itself, at once.
+/// The boot stage's choice on a device whose bootloader is whole. Program 1 starts by itself, at
+/// once.
 pub fn choice(
     flash: &impl Flash,
     parameters: &impl Parameters,

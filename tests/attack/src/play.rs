@@ -22,8 +22,8 @@ impl fmt::Display for Broken {
     }
 }
 
-/// What attacks have met: the states of a renewal with the origin of the bootloader, the lives of the device, and the
-/// programs that were installed.
+/// What attacks have met: the states of a renewal with the origin of the bootloader, the lives of
+/// the device, and the programs that were installed.
 #[derive(Default)]
 pub struct Met {
     pub programs: u64,

@@ -37,7 +37,8 @@ pub struct History {
     released: BTreeSet<u8>,
     /// A root has permitted to erase since the last reset.
     may_erase: bool,
-    /// The content that a begun download of a program may name in 2006h; `None` since something else came.
+    /// The content that a begun download of a program may name in 2006h; `None` since something
+    /// else came.
     begun: Vec<(u8, Option<Content>)>,
     /// The highest security counter of a program that is there and counts, by program.
     proved: Vec<u32>,
@@ -156,7 +157,8 @@ impl History {
         }
     }
 
-    /// What 2006h may name: the content whose block 0 came, if no other content came for this program.
+    /// What 2006h may name: the content whose block 0 came, if no other content came for this
+    /// program.
     fn begin(&mut self, sub: u8, sent: Sent) {
         let is_pure =
             matches!(sent.part, Part::Block(_)) && sent.flaw == Flaw::None && !self.setup.takes_sealed;

@@ -7,7 +7,8 @@ use attack::play::{act, Met};
 use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE, START};
 use kit::rig::{Setup, AT_ONCE_2, ESACADEMY_2, LIFT_2, STANDARD_1, STANDARD_2};
 
-/// The moments, in steps of the device's work. A sector is erased and some words are programmed in 100.
+/// The moments, in steps of the device's work. A sector is erased and some words are programmed in
+/// 100.
 const MOMENTS: u32 = 400;
 /// CiA 302-3: a reset, which starts a program after a stream.
 const RESET: u8 = 2;
@@ -44,9 +45,9 @@ type At = fn(&'static Setup, u32) -> Vec<Action>;
 
 /// A device with these programs, and what comes in this moment.
 fn play(setup: &'static Setup, before: &[Action], at: At) -> Vec<(u32, Met)> {
-    let mut flash = Model::new(setup, 1024, 0).flash();
-    let prepared = act(Model::on(setup, 1024, flash, None), before, &mut Met::default());
-    flash = prepared.expect("it is prepared").device().flash();
+    let mut met = Met::default();
+    let prepared = act(Model::new(setup, 1024, 0), before, &mut met).expect("it is prepared");
+    let flash = prepared.device().flash();
     let one = |moment| {
         let (actions, mut met) = (at(setup, moment), Met::default());
         let device = Model::on(setup, 1024, flash.clone(), None);
@@ -58,8 +59,8 @@ fn play(setup: &'static Setup, before: &[Action], at: At) -> Vec<(u32, Met)> {
     (0..MOMENTS).map(one).collect()
 }
 
-/// A download to program 1 is aborted, the password or CLEAR arrives at any moment of the remaining work, and a
-/// download to program 2 is aborted, too.
+/// A download to program 1 is aborted, the password or CLEAR arrives at any moment of the remaining
+/// work, and a download to program 2 is aborted, too.
 #[test]
 fn a_record_never_outlives_its_program_whenever_the_password_or_clear_comes() {
     for setup in [&LIFT_2, &ESACADEMY_2, &STANDARD_2, &AT_ONCE_2] {
@@ -71,8 +72,9 @@ fn a_record_never_outlives_its_program_whenever_the_password_or_clear_comes() {
     }
 }
 
-/// A stream to one program is complete, and one to the other program is being finished: START and the reset for the
-/// first one start it, or are refused. The same while a signature of the other one is being stored.
+/// A stream to one program is complete, and one to the other program is being finished: START and
+/// the reset for the first one start it, or are refused. The same while a signature of the other
+/// one is being stored.
 #[test]
 fn what_is_started_is_the_program_that_was_named() {
     let setup = &STANDARD_2;

@@ -1,7 +1,6 @@
-//! Faults that were found by review: work on one program that affects another one (`tests/attack` has more), and the
-//! journal of a newer bootloader.
+//! Faults that were found by review: work on one program that affects another one (`tests/attack`
+//! has more), and the journal of a newer bootloader.
 
-use canopen::od::Address;
 use canopen::{BitRate, NodeId};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{block, crc32, program, words, Rig, Setup, ESACADEMY_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
