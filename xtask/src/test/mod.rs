@@ -226,8 +226,10 @@ fn of_default(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
 fn chips(summary: &mut Summary) -> Outcome {
     of_default(Tier::Chips, &[], summary)?;
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
-    let core =
-        format!("(binary_id(coboot-core::it) + binary_id(coboot-attack::lives)) & {}", Tier::Product.filter());
+    let core = format!(
+        "(binary_id(coboot-core::it) + binary_id(coboot-attack::lives)) & {}",
+        Tier::Product.filter()
+    );
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
     runner::run(&workspace::on_host(), &core, "[sealed] ", &takes_sealed, summary)?;
     other_chips().try_for_each(|board| on_board(board, Tier::Chips, summary))
