@@ -1,5 +1,6 @@
 //! `--dialect` and `--unlock`: the dialect of a bootloader, and its password.
 
+use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 use coflash_core::device::Dialect;
 use coflash_core::update::Password;
@@ -17,33 +18,40 @@ pub(super) struct Access {
     unlock: Option<Password>,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Name {
-    /// Detect it by the device type and the objects of the device.
-    Auto,
-    /// Block files, as SYS TEC's tools send them.
-    Block,
-    /// An image in one download (CiA 302-3).
-    Raw,
-    /// Intel HEX in one download (CiA 302-3).
-    Hex,
-    /// CiA 417: a password in 6005h, then an image at node-ID 126.
-    Lift,
-    /// Intel HEX behind a password in 7F50h, as ESAcademy describes it.
-    Esacademy,
+/// A dialect, or none: then it is detected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Name(Option<Dialect>);
+
+impl Name {
+    const ALL: [Self; Dialect::ALL.len() + 1] = {
+        let mut names = [Self(None); Dialect::ALL.len() + 1];
+        let mut at = 0;
+        while at < Dialect::ALL.len() {
+            names[at + 1] = Self(Some(Dialect::ALL[at]));
+            at += 1;
+        }
+        names
+    };
+}
+
+impl ValueEnum for Name {
+    fn value_variants<'a>() -> &'a [Self] {
+        &Self::ALL
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        let (name, help) = match self.0 {
+            None => ("auto", "Detect it by the device type and the objects of the device"),
+            Some(dialect) => (dialect.name(), dialect.help()),
+        };
+        Some(PossibleValue::new(name).help(help))
+    }
 }
 
 impl Access {
     /// The dialect; `None` to detect it.
     pub(super) fn dialect(&self) -> Option<Dialect> {
-        match self.dialect {
-            Name::Auto => None,
-            Name::Block => Some(Dialect::Block),
-            Name::Raw => Some(Dialect::Raw),
-            Name::Hex => Some(Dialect::Hex),
-            Name::Lift => Some(Dialect::Lift),
-            Name::Esacademy => Some(Dialect::EsAcademy),
-        }
+        self.dialect.0
     }
 
     pub(super) fn unlock(&self) -> Option<Password> {

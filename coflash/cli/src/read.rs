@@ -118,9 +118,7 @@ impl Read {
         let (dialect, unlock) = (self.access.dialect(), self.access.unlock());
         let waiting = context.waiting(format!("{at} of node {node} has been read"));
         let bytes = match (dialect, unlock) {
-            (None | Some(Dialect::Block | Dialect::Raw | Dialect::Hex), None) => {
-                session.upload(at, &mut |_| {})
-            }
+            (dialect, None) if !dialect.is_some_and(Dialect::has_password) => session.upload(at, &mut |_| {}),
             _ => read_locked(session, at, dialect, unlock, &mut |event| context.out.detail(event)),
         }
         .map_err(|error| Failure::diagnosed(error, session))?;

@@ -11,35 +11,100 @@ use serde::{Serialize, Serializer};
 
 use super::device_type::DeviceType;
 
-/// The dialect of a bootloader.
+/// The form in which a program goes to a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Dialect {
-    /// Block files: the dialect of SYS TEC and of coboot.
-    Block,
-    /// CiA 302-3 with a binary image.
-    Raw,
-    /// CiA 302-3 with Intel HEX.
+pub enum Form {
+    /// The blocks of a block file.
+    Blocks,
+    /// The contents of the flash, from the program's start on.
+    Image,
+    /// Intel HEX text.
     Hex,
+}
+
+/// What there is to know about a dialect besides its procedure.
+#[derive(Clone, Copy)]
+struct Row {
+    name: &'static str,
+    words: &'static str,
+    help: &'static str,
+    form: Form,
+    password: bool,
+}
+
+/// Defines the dialects: a row for each.
+macro_rules! dialects {
+    ($($(#[$doc:meta])* $dialect:ident $row:tt)+) => {
+        /// The dialect of a bootloader.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum Dialect {
+            $($(#[$doc])* $dialect,)+
+        }
+
+        impl Dialect {
+            /// All dialects.
+            pub const ALL: [Dialect; [$(Dialect::$dialect),+].len()] = [$(Dialect::$dialect),+];
+
+            const fn row(self) -> Row {
+                match self {
+                    $(Dialect::$dialect => Row $row,)+
+                }
+            }
+        }
+    };
+}
+
+dialects! {
+    /// Block files: the dialect of SYS TEC and of coboot.
+    Block {
+        name: "block", words: "block files, SYS TEC", form: Form::Blocks, password: false,
+        help: "Block files, as SYS TEC's tools send them",
+    }
+    /// CiA 302-3 with a binary image.
+    Raw {
+        name: "raw", words: "CiA 302-3, an image", form: Form::Image, password: false,
+        help: "An image in one download (CiA 302-3)",
+    }
+    /// CiA 302-3 with Intel HEX.
+    Hex {
+        name: "hex", words: "CiA 302-3, Intel HEX", form: Form::Hex, password: false,
+        help: "Intel HEX in one download (CiA 302-3)",
+    }
     /// CiA 417, as CiA 814-1 describes it.
-    Lift,
+    Lift {
+        name: "lift", words: "CiA 417", form: Form::Image, password: true,
+        help: "CiA 417: a password in 6005h, then an image at node-ID 126",
+    }
     /// ESAcademy's minimal boot loader.
-    EsAcademy,
+    EsAcademy {
+        name: "esacademy", words: "Intel HEX behind a password", form: Form::Hex, password: true,
+        help: "Intel HEX behind a password in 7F50h, as ESAcademy describes it",
+    }
 }
 
 impl Dialect {
-    /// All dialects.
-    pub const ALL: [Self; 5] = [Self::Block, Self::Raw, Self::Hex, Self::Lift, Self::EsAcademy];
-
     /// The name on the command line.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        match self {
-            Self::Block => "block",
-            Self::Raw => "raw",
-            Self::Hex => "hex",
-            Self::Lift => "lift",
-            Self::EsAcademy => "esacademy",
-        }
+        self.row().name
+    }
+
+    /// A line of help.
+    #[must_use]
+    pub const fn help(self) -> &'static str {
+        self.row().help
+    }
+
+    /// The form of a program.
+    #[must_use]
+    pub const fn form(self) -> Form {
+        self.row().form
+    }
+
+    /// Whether its devices are locked by a password.
+    #[must_use]
+    pub const fn has_password(self) -> bool {
+        self.row().password
     }
 
     /// The dialect with this name.
@@ -64,13 +129,8 @@ impl Dialect {
 
 impl fmt::Display for Dialect {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Block => "block (block files, SYS TEC)",
-            Self::Raw => "raw (CiA 302-3, an image)",
-            Self::Hex => "hex (CiA 302-3, Intel HEX)",
-            Self::Lift => "lift (CiA 417)",
-            Self::EsAcademy => "esacademy (Intel HEX behind a password)",
-        })
+        let Row { name, words, .. } = self.row();
+        write!(f, "{name} ({words})")
     }
 }
 

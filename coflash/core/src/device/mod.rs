@@ -30,7 +30,7 @@ pub mod value;
 
 pub use self::delivery::{delivery, Delivery};
 pub use self::device_type::DeviceType;
-pub use self::dialect::Dialect;
+pub use self::dialect::{Dialect, Form};
 pub use self::doing::{Doing, LssDoing};
 pub use self::error::Error;
 pub use self::info::{info, DeviceInfo};

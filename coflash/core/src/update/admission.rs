@@ -14,7 +14,7 @@ use crate::advice::Advice;
 use crate::device::access::{security_of, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
-use crate::device::{Dialect, Session};
+use crate::device::{Dialect, Form, Session};
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{AddressRange, Program};
@@ -230,22 +230,22 @@ fn admit_place(
     let Some(told) = program_region(session, number)? else { return Ok(false) };
     let region = AddressRange { first: told.base, last: told.last() };
     let (image, start, size) = (program.image(), program.start(), u64::from(program.size()));
-    let fits = match dialect {
+    let fits = match dialect.form() {
         // The CRC of the program counts from the region's start.
-        Dialect::Block => program.check_region(region).is_ok(),
-        Dialect::Hex | Dialect::EsAcademy if region.contains(&program.span()) => {
+        Form::Blocks => program.check_region(region).is_ok(),
+        Form::Hex if region.contains(&program.span()) => {
             // The data go to their own addresses: the vectors must be there.
             judge(image, region.first, None).map_err(no_program)?;
             true
         }
-        Dialect::Hex | Dialect::EsAcademy => false,
-        Dialect::Raw | Dialect::Lift if start == 0 => {
+        Form::Hex => false,
+        Form::Image if start == 0 => {
             if !is_data(dialect, number) {
                 judge_place(image, region).map_err(no_program)?;
             }
             size <= region.len()
         }
-        Dialect::Raw | Dialect::Lift => start == region.first && size <= region.len(),
+        Form::Image => start == region.first && size <= region.len(),
     };
     if fits {
         return Ok(true);

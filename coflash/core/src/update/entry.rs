@@ -3,7 +3,6 @@
 use super::admission::Admission;
 use super::dialect;
 use super::event::Phase;
-use super::options::FlashOptions;
 use super::payload::Payload;
 use super::reach::Found;
 use super::running::RunningUpdate;
@@ -19,22 +18,22 @@ pub(super) fn enter(
     file: &Payload,
     found: Found,
     mut admission: Admission<'_>,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<(), Error> {
-    match (options.alone, options.wait) {
+    let alone = update.options.alone;
+    match (alone, update.options.wait) {
         (false, _) => {}
         (true, false) => session.still_alone()?,
         (true, true) => session.ensure_alone()?,
     }
     let before = session.now();
-    update.dialect = dialect::procedure(file, found.dialect).enter(session, found, options, update)?;
+    update.dialect = dialect::procedure(file, found.dialect).enter(session, found, update)?;
     let is_ready = (|| {
         if !found.running.is_bootloader() {
             admission.ask(session, update.dialect)?;
         }
         match update.called {
-            _ if !options.alone => Ok(()),
+            _ if !alone => Ok(()),
             Some(_) => session.await_peace(before),
             None => session.still_alone(),
         }

@@ -8,10 +8,11 @@ use seal::wire::BOOTLOADER;
 use shared_abi::ram_image::Version;
 
 use crate::device::error::flash_error_number;
+use crate::device::Form;
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Format};
 use crate::file::sealed::{Refusal, SealedFile};
-use crate::file::{judge, Program, Target};
+use crate::file::{ihex, judge, Program, Target};
 
 /// What a device gets in an update, shared by several devices.
 #[derive(Clone, Debug)]
@@ -23,9 +24,6 @@ pub enum Payload {
     /// The RAM image of a bootloader, which takes the place of that of the device.
     Bootloader(Arc<RamImage>),
 }
-
-/// The form in which a program goes in one download.
-pub(super) type Encoder = fn(&Program) -> Cow<'_, [u8]>;
 
 impl Payload {
     /// The bootloader in a file of this format, plain or sealed; `None` for any other file, also for one
@@ -106,11 +104,12 @@ impl Payload {
         self.bootloader().is_some()
     }
 
-    /// The data for a device that takes everything in one download: a program in the form of this
-    /// encoder, all else unchanged.
-    pub(super) fn encoded(&self, encode: Encoder) -> Cow<'_, [u8]> {
+    /// The data for a device that takes everything in one download: a program in this form, from its start
+    /// on, all else unchanged.
+    pub(super) fn encoded(&self, form: Form) -> Cow<'_, [u8]> {
         match self {
-            Self::Program(program) => encode(program),
+            Self::Program(program) if form == Form::Hex => ihex::emit(program.image()).into_bytes().into(),
+            Self::Program(program) => program.flash_image(),
             Self::Sealed(file) => Cow::Borrowed(file.bytes()),
             Self::Bootloader(image) => Cow::Borrowed(image.bytes()),
         }

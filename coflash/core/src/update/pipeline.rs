@@ -41,8 +41,8 @@ pub fn flash(
 ) -> Result<Report, Error> {
     let file = &file.into();
     let (result, node, transfers) = telling_silence(session, tell, |session, tell| {
-        let mut update = RunningUpdate::new(session.node(), tell);
-        let result = procedure(session, file, options, &mut update);
+        let mut update = RunningUpdate::new(session.node(), *options, tell);
+        let result = procedure(session, file, &mut update);
         let left = match &result {
             Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
             Err(error) => look(session, error, &update, options.program, file.crcs()),
@@ -63,26 +63,25 @@ pub fn flash(
 fn procedure(
     session: &mut Session<'_>,
     file: &Payload,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Report, Error> {
     let began = session.now();
-    reach(session, options, update, |session, update| {
-        let found = find(session, options, update)?;
-        let admission = admit(session, file, found.dialect, options)?;
-        enter(session, file, found, admission, options, update)
+    reach(session, update, |session, update| {
+        let found = find(session, update)?;
+        let admission = admit(session, file, found.dialect, &update.options)?;
+        enter(session, file, found, admission, update)
     })?;
-    let dialect = update.dialect;
+    let (dialect, options) = (update.dialect, update.options);
     let its = dialect::procedure(file, dialect);
     if dialect != Dialect::Block {
         session.leave_group();
     }
-    let downloaded = its.download(session, file, options, update)?;
+    let downloaded = its.download(session, file, update)?;
     let Downloaded { repeats, took: transfer, released, renewal } = downloaded;
     let running = match renewal {
         Some(renewal) => renewal.running,
         None if options.start => {
-            let time = watch::time(session, dialect, options)?;
+            let time = watch::time(session, dialect, &options)?;
             update.tell(Phase::Starting.into());
             let starts = session.now();
             let running = its.start(session, update.original, options.program)?;

@@ -2,7 +2,6 @@
 
 use super::catch::knock;
 use super::event::{Event, Note, Phase};
-use super::options::FlashOptions;
 use super::running::RunningUpdate;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, DeviceType, Dialect, Error, Session};
@@ -23,12 +22,11 @@ pub(super) struct Found {
 /// [`Error::NotAlone`], [`Error::Cancelled`], and those of the attempt.
 pub(super) fn reach<R>(
     session: &mut Session<'_>,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
     mut attempt: impl FnMut(&mut Session<'_>, &mut RunningUpdate<'_>) -> Result<R, Error>,
 ) -> Result<R, Error> {
-    if !options.wait {
-        if options.alone {
+    if !update.options.wait {
+        if update.options.alone {
             // Check before the first request, which would disturb another tool's running transfer.
             // While the tool catches a device, there is no time for this: a rescue window is as short
             // as the check.
@@ -57,18 +55,14 @@ pub(super) fn reach<R>(
 ///
 /// # Errors
 /// [`Error::NoAnswer`], [`Error::WrongTarget`], and the errors of a [read](Session::read).
-pub(super) fn find(
-    session: &mut Session<'_>,
-    options: &FlashOptions,
-    update: &mut RunningUpdate<'_>,
-) -> Result<Found, Error> {
+pub(super) fn find(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> Result<Found, Error> {
     let running = session.find()?;
     update.tell(Event::Found(running));
-    if let Some(target) = options.check_target {
+    if let Some(target) = update.options.check_target {
         check_target(session, target)?;
         update.tell(Note::TargetRight(target).into());
     }
-    let dialect = match options.dialect {
+    let dialect = match update.options.dialect {
         Some(dialect) => dialect,
         None => recognise(session, running, CALL_BACK)?,
     };

@@ -6,6 +6,7 @@ use canopen::NodeId;
 
 use super::device_after::DeviceState;
 use super::event::{Event, Note, Phase, Warning};
+use super::options::FlashOptions;
 use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
 use crate::device::session::Silence;
@@ -39,6 +40,8 @@ pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut
 
 /// A running update.
 pub(super) struct RunningUpdate<'t> {
+    /// What the user wants.
+    pub(super) options: FlashOptions,
     /// The node at its start: a lift's bootloader has another one.
     pub(super) original: NodeId,
     /// The dialect of the bootloader, as far as it is known.
@@ -66,8 +69,9 @@ pub(super) struct RunningUpdate<'t> {
 
 impl<'t> RunningUpdate<'t> {
     /// An update of this node that has not done anything yet.
-    pub(super) fn new(original: NodeId, tell: &'t mut dyn FnMut(Event)) -> Self {
+    pub(super) fn new(original: NodeId, options: FlashOptions, tell: &'t mut dyn FnMut(Event)) -> Self {
         Self {
+            options,
             original,
             dialect: Dialect::Block,
             state: DeviceState::Untouched,

@@ -1,7 +1,6 @@
 //! The trial run: a program is started once before it is released for autostart.
 
 use super::event::Phase;
-use super::options::FlashOptions;
 use super::running::RunningUpdate;
 use super::steps::{call_back, check_target, start};
 use super::watch;
@@ -10,13 +9,10 @@ use crate::device::info::{identity, Identity};
 use crate::device::{Dialect, Session};
 
 /// Steps 10 to 13: starts the program for a trial, compares identities, and calls it back.
-pub(super) fn run(
-    session: &mut Session<'_>,
-    options: &FlashOptions,
-    update: &mut RunningUpdate<'_>,
-) -> Result<(), Error> {
+pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> Result<(), Error> {
+    let options = update.options;
     let bootloader = identity(session)?;
-    let time = watch::time(session, Dialect::Block, options)?;
+    let time = watch::time(session, Dialect::Block, &options)?;
     update.tell(Phase::TrialStarting.into());
     let began = session.now();
     let running = start(session, options.program).map_err(failed)?;

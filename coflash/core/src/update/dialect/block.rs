@@ -42,10 +42,9 @@ impl Procedure for Block {
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, found, options, update)
+        enter_by_call(session, found, update)
     }
 
     /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
@@ -56,23 +55,21 @@ impl Procedure for Block {
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (number, crcs) = (options.program, file.crcs());
+        let (options, crcs) = (update.options, file.crcs());
+        let number = options.program;
         let mut in_group = session.join_group()?;
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
         }
         let (file, is_sealed) = match file {
             Payload::Program(program) => (BlockFile::of(program), false),
-            Payload::Bootloader(image) => {
-                return cia302::download(session, image.bytes(), crcs, options, update)
-            }
+            Payload::Bootloader(image) => return cia302::download(session, image.bytes(), crcs, update),
             Payload::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
-                    None => return cia302::download(session, sealed.bytes(), crcs, options, update),
+                    None => return cia302::download(session, sealed.bytes(), crcs, update),
                     Some(size) => size,
                 };
                 (cut_up(session, sealed, size, number)?, true)
@@ -82,7 +79,7 @@ impl Procedure for Block {
         let most = if in_group { usize::MAX } else { file.size() as usize / JOINED_PARTS };
         let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size.min(most)));
         let file = Cut { own: &file, joined: joined.as_ref() };
-        let sent = send_verified(session, file, crcs, &mut in_group, options, update);
+        let sent = send_verified(session, file, crcs, &mut in_group, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
         }
@@ -97,7 +94,7 @@ impl Procedure for Block {
             return Ok(Downloaded { repeats, took, released: Some(false), renewal: None });
         }
         if options.trial_run {
-            trial::run(session, options, update)?;
+            trial::run(session, update)?;
         }
         steps::release(session, number, &mut |event| update.tell(event))?;
         update.state = DeviceState::Released;
@@ -193,18 +190,17 @@ fn send_verified(
     file: Cut<'_>,
     crcs: [u32; 2],
     in_group: &mut bool,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
-    let number = options.program;
-    let partial = if options.from_start { None } else { partial_download(session, number)? };
+    let FlashOptions { program: number, from_start, .. } = update.options;
+    let partial = if from_start { None } else { partial_download(session, number)? };
     let mut partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
     // Some bootloaders count the block that they refused last: what follows it would cost the old program.
     if partial.is_some() && session.status(number)?.error.is_some() {
         partial = None;
     }
     let mut all = |from, update: &mut RunningUpdate<'_>| {
-        let sent = send(session, file, from, in_group, options, update)?;
+        let sent = send(session, file, from, in_group, update)?;
         steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
         Ok(sent)
     };
@@ -226,10 +222,9 @@ fn send(
     file: Cut<'_>,
     partial: Option<PartialDownload>,
     in_group: &mut bool,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
-    let number = options.program;
+    let number = update.options.program;
     let before = steps::told_before(session, number)?;
     update.erases(before);
     if let Some(partial) = partial {
@@ -245,7 +240,7 @@ fn send(
         return Err(error);
     }
     let began = session.now();
-    let repeats = send_blocks(session, file, partial, in_group, options, update)?;
+    let repeats = send_blocks(session, file, partial, in_group, update)?;
     Ok((repeats, session.now().saturating_sub(began)))
 }
 
@@ -258,9 +253,9 @@ fn send_blocks(
     file: Cut<'_>,
     partial: Option<PartialDownload>,
     in_group: &mut bool,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
+    let options = update.options;
     let begun = partial.and_then(|partial| partial.checksum_of(file.own));
     let mut checksum = begun.unwrap_or(file.own.checksum());
     let size = |blocks: &VecDeque<FileBlock<'_>>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
@@ -291,7 +286,7 @@ fn send_blocks(
             may_split: may_split && file.has_joined(&block),
         };
         let form = session.transfers();
-        let sent = send_block(session, one, options, &mut |event| match event {
+        let sent = send_block(session, one, &options, &mut |event| match event {
             Event::Progress { done: part, .. } => update.tell(Event::Progress { done: done + part, total }),
             Event::Note(Note::Together { devices }) if devices == together => {}
             Event::Warning(Warning::GroupDisturbed) if disturbed => {}

@@ -4,54 +4,42 @@
 use canopen::program::{self, ProgramControl, ProgramState};
 use canopen::Address;
 
-use super::encode;
 use super::procedure::{Downloaded, Procedure};
 use super::whole::{self, Whole};
 use crate::device::error::absent;
 use crate::device::{Dialect, Doing, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
-use crate::update::options::FlashOptions;
-use crate::update::payload::{Encoder, Payload};
+use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::{call_back, clear_and_wait, running_program};
 
 /// See the [module](self).
-pub(super) struct Cia302 {
-    dialect: Dialect,
-    encode: Encoder,
-}
-
-/// With the contents of the flash.
-pub(super) const RAW: Cia302 = Cia302 { dialect: Dialect::Raw, encode: encode::raw };
-/// With Intel HEX text.
-pub(super) const HEX: Cia302 = Cia302 { dialect: Dialect::Hex, encode: encode::hex };
+pub(super) struct Cia302(pub(super) Dialect);
 
 impl Procedure for Cia302 {
     fn enter(
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         if !found.running.is_bootloader() {
             update.state = DeviceState::Called;
-            stop_program(session, options.program, update)?;
+            stop_program(session, update.options.program, update)?;
         }
-        update.tell(Note::Dialect { dialect: self.dialect }.into());
-        Ok(self.dialect)
+        update.tell(Note::Dialect { dialect: self.0 }.into());
+        Ok(self.0)
     }
 
     fn download(
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        download(session, &file.encoded(self.encode), file.crcs(), options, update)
+        download(session, &file.encoded(self.0.form()), file.crcs(), update)
     }
 }
 
@@ -60,15 +48,14 @@ pub(super) fn download(
     session: &mut Session<'_>,
     content: &[u8],
     crcs: [u32; 2],
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
-    let number = options.program;
+    let number = update.options.program;
     let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
         clear_and_wait(session, number, &mut |event| update.tell(event))
     };
     let whole = Whole { number, content, doing: Doing::Program, prepare: &prepare, status: whole::status };
-    whole::download(session, &whole, crcs, options, update)
+    whole::download(session, &whole, crcs, update)
 }
 
 /// Calls the bootloader of a device that only supports CiA 302-3 with STOP: the bootloader then

@@ -5,14 +5,13 @@ use std::time::Duration;
 use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
-use super::encode::hex;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
 use super::restart::{arrived, reset_program};
 use super::whole::{self, idle, Said, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::event::Note;
-use crate::update::options::FlashOptions;
+use crate::update::password::Password;
 use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
@@ -33,36 +32,39 @@ impl Procedure for EsAcademy {
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, found, options, update)
+        enter_by_call(session, found, update)
     }
 
     fn download(
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = file.encoded(hex);
+        let (number, doing, password) = (update.options.program, Doing::Program, update.options.unlock);
+        let content = file.encoded(Dialect::EsAcademy.form());
         let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
-            if self.unlock(session, options, options.program)? {
+            if self.unlock(session, password, number)? {
                 update.tell(Note::Unlocked.into());
             }
             Ok(())
         };
-        let (number, doing) = (options.program, Doing::Program);
         let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-        whole::download(session, &whole, file.crcs(), options, update)
+        whole::download(session, &whole, file.crcs(), update)
     }
 
     /// The password is optional; without it, the download alone must be sufficient. That of a program
     /// erases it.
-    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, number: u8) -> Result<bool, Error> {
+    fn unlock(
+        &self,
+        session: &mut Session<'_>,
+        password: Option<Password>,
+        number: u8,
+    ) -> Result<bool, Error> {
         let node = session.node();
-        let password = match options.unlock {
+        let password = match password {
             None => PASSWORD,
             Some(password) => password.number().ok_or(Error::NotInDialect {
                 dialect: Dialect::EsAcademy,

@@ -6,7 +6,6 @@ use canopen::nmt::parse_state_message;
 use canopen::program::LIFT_NODE_ID;
 use canopen::{AbortCode, Address, NodeId};
 
-use super::encode::raw;
 use super::procedure::{Downloaded, Procedure};
 use super::restart::{arrived, reset_program};
 use super::whole::{self, Whole};
@@ -41,9 +40,9 @@ impl Procedure for Lift {
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
+        let options = update.options;
         if !options.follow {
             let what = "the bootloaders share a node-ID: update the devices one after the other";
             return Err(Error::NotInDialect { dialect: Dialect::Lift, what });
@@ -69,19 +68,18 @@ impl Procedure for Lift {
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = file.encoded(raw);
+        let content = file.encoded(Dialect::Lift.form());
         // The device is already unlocked; the download overwrites the old program.
         let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
-        let (number, doing, status) = (options.program, Doing::Program, whole::status);
+        let (number, doing, status) = (update.options.program, Doing::Program, whole::status);
         let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-        whole::download(session, &whole, file.crcs(), options, update)
+        whole::download(session, &whole, file.crcs(), update)
     }
 
-    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, _: u8) -> Result<bool, Error> {
-        let password = options.unlock.ok_or(Error::NoPassword { node: session.node() })?;
+    fn unlock(&self, session: &mut Session<'_>, password: Option<Password>, _: u8) -> Result<bool, Error> {
+        let password = password.ok_or(Error::NoPassword { node: session.node() })?;
         unlock(session, password).map(|()| true)
     }
 
@@ -224,15 +222,17 @@ pub fn read_locked(
     };
     let what = match dialect {
         Dialect::Lift => None,
-        Dialect::EsAcademy => Some("the password erases the program, so there is nothing left to read"),
-        Dialect::Block | Dialect::Raw | Dialect::Hex => Some("no password allows reading"),
+        _ if dialect.has_password() => {
+            Some("the password erases the program, so there is nothing left to read")
+        }
+        _ => Some("no password allows reading"),
     };
     if let Some(what) = what {
         return Err(Error::NotInDialect { dialect, what });
     }
     let original = session.node();
     check(session, running, password)?;
-    unlock_bootloader(session, password, &mut RunningUpdate::new(original, tell))?;
+    unlock_bootloader(session, password, &mut RunningUpdate::new(original, FlashOptions::default(), tell))?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
         let restarted = reset_program(session, LIFT_PROGRAM);

@@ -9,9 +9,9 @@
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
-//! `raw` and `hex` are one procedure with two encoders. The renewal of a bootloader is one more, in every
-//! dialect. To add a dialect, add a file that implements
-//! `Procedure` and a line in `of`.
+//! `raw` and `hex` are one procedure. The renewal of a bootloader is one more, in every
+//! dialect. To add a dialect, add a row to [`Dialect`], and here
+//! a file that implements `Procedure` and a line in `of`.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
 use super::payload::Payload;
@@ -19,7 +19,6 @@ use crate::device::Dialect;
 
 mod block;
 mod cia302;
-mod encode;
 mod esacademy;
 mod lift;
 mod procedure;
@@ -51,8 +50,8 @@ pub(super) fn procedure(file: &Payload, dialect: Dialect) -> &'static dyn Proced
 pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
     match dialect {
         Dialect::Block => &block::Block,
-        Dialect::Raw => &cia302::RAW,
-        Dialect::Hex => &cia302::HEX,
+        Dialect::Raw => &cia302::Cia302(Dialect::Raw),
+        Dialect::Hex => &cia302::Cia302(Dialect::Hex),
         Dialect::Lift => &lift::Lift,
         Dialect::EsAcademy => &esacademy::EsAcademy,
     }

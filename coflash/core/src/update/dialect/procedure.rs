@@ -7,7 +7,7 @@ use canopen::NodeId;
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
-use crate::update::options::FlashOptions;
+use crate::update::password::Password;
 use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::renewal::Renewal;
@@ -25,7 +25,6 @@ pub(in crate::update) trait Procedure {
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error>;
 
@@ -38,7 +37,6 @@ pub(in crate::update) trait Procedure {
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error>;
 
@@ -47,8 +45,13 @@ pub(in crate::update) trait Procedure {
     ///
     /// # Errors
     /// [`Error::NoPassword`], and [`Error::Refused`] for a wrong password.
-    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, number: u8) -> Result<bool, Error> {
-        let _ = (session, options, number);
+    fn unlock(
+        &self,
+        session: &mut Session<'_>,
+        password: Option<Password>,
+        number: u8,
+    ) -> Result<bool, Error> {
+        let _ = (session, password, number);
         Ok(false)
     }
 
@@ -79,10 +82,9 @@ pub(in crate::update) struct Downloaded {
 pub(super) fn enter_by_call(
     session: &mut Session<'_>,
     found: Found,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
-    let dialect = call_back(session, found, options, update)?;
+    let dialect = call_back(session, found, update)?;
     update.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
 }
@@ -92,18 +94,17 @@ pub(super) fn enter_by_call(
 pub(super) fn call_back(
     session: &mut Session<'_>,
     found: Found,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
     if found.running.is_bootloader() {
         return Ok(found.dialect);
     }
-    let program = steps::running_program(session, options.program)?;
+    let program = steps::running_program(session, update.options.program)?;
     update.state = DeviceState::Called;
     update.called = Some(program.unwrap_or(steps::CALL_BACK));
     update.tell(Phase::CallingBack.into());
     let running = steps::call_back(session)?;
     update.tell(Phase::InBootloader.into());
     let its = Dialect::of_bootloader(running, session.node());
-    Ok(options.dialect.or(its).unwrap_or(found.dialect))
+    Ok(update.options.dialect.or(its).unwrap_or(found.dialect))
 }

@@ -10,7 +10,7 @@ use super::procedure::{call_back, Downloaded, Procedure};
 use super::whole::{self, Whole};
 use crate::device::error::told;
 use crate::device::renewal::{bootloader, progress, Bootloader};
-use crate::device::{Dialect, Doing, Error, Session};
+use crate::device::{Dialect, Doing, Error, Form, Session};
 use crate::update::admission::takes_open;
 use crate::update::device_after::DeviceState;
 use crate::update::event::Phase;
@@ -37,12 +37,11 @@ impl Procedure for Renew {
         &self,
         session: &mut Session<'_>,
         found: Found,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         match found.dialect {
-            Dialect::Lift => super::of(Dialect::Lift).enter(session, found, options, update),
-            _ => call_back(session, found, options, update),
+            Dialect::Lift => super::of(Dialect::Lift).enter(session, found, update),
+            _ => call_back(session, found, update),
         }
     }
 
@@ -57,15 +56,14 @@ impl Procedure for Renew {
         &self,
         session: &mut Session<'_>,
         file: &Payload,
-        options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         (update.state, update.touched) = (DeviceState::Called, true);
-        let result = renew(session, file, options, update);
+        let result = renew(session, file, update);
         // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in
         // a device that is silent; the next power-on starts it there.
         let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
-        let again = update.called.filter(|_| options.start && !is_silent).map(|program| {
+        let again = update.called.filter(|_| update.options.start && !is_silent).map(|program| {
             update.tell(Phase::Starting.into());
             super::of(update.dialect).start(session, update.original, program)
         });
@@ -83,7 +81,6 @@ impl Procedure for Renew {
 fn renew(
     session: &mut Session<'_>,
     file: &Payload,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Renewal, Error> {
     let node = session.node();
@@ -92,21 +89,20 @@ fn renew(
         takes_open(session)?;
     }
     let (number, from, to) = (old.number, old.version, file.bootloader().unwrap_or(old.version));
-    let its = Renewing { number, options };
-    let running = its.settled(session, old, update)?;
+    let running = settled(session, old, update)?;
     let (mut repeats, mut transfer) = (0, Duration::ZERO);
     let unchanged =
         Renewal { number, from, to, unchanged: true, repeats, transfer, took: Duration::ZERO, running: None };
     let is_same = is_same(session, file, number)?;
     let is_open = running.origin == Origin::Trial && running.state == State::Staged;
-    if is_same && running.state != State::Staged && !options.force {
+    if is_same && running.state != State::Staged && !update.options.force {
         return Ok(unchanged);
     }
     update.tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
     if !(is_same && is_open) {
-        its.leave_trial(session, running, update)?;
+        leave_trial(session, number, running, update)?;
         let began = session.now();
-        repeats = its.stage(session, file, update)?;
+        repeats = stage(session, number, file, update)?;
         transfer = session.now().saturating_sub(began);
         if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
             // The device has found the same image.
@@ -116,11 +112,11 @@ fn renew(
         try_it(session, number)?;
     }
     update.tell(Phase::OnTrial.into());
-    if let Err(error) = its.unlock(session, update).and_then(|()| install(session, number)) {
+    if let Err(error) = unlock(session, number, update).and_then(|()| install(session, number)) {
         let is_refusal = matches!(error, Error::Failed { .. } | Error::Refused { .. });
         // A bootloader that is not confirmed need not wait for its end. The reason stays the result.
         match progress(session) {
-            Ok(Some(running)) if is_refusal => drop(its.leave_trial(session, running, update)),
+            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, update)),
             _ => {}
         }
         return Err(error);
@@ -137,98 +133,88 @@ fn renew(
     Ok(Renewal { to, unchanged: false, repeats, transfer, ..unchanged })
 }
 
-/// A renewal under the program number of the bootloader.
-struct Renewing<'o> {
-    number: u8,
-    options: &'o FlashOptions,
+/// Writes the password of the bootloader, if it has one: also after each reset.
+fn unlock(session: &mut Session<'_>, number: u8, update: &RunningUpdate<'_>) -> Result<(), Error> {
+    super::of(update.dialect).unlock(session, update.options.unlock, number).map(drop)
 }
 
-impl Renewing<'_> {
-    /// Writes the password of the bootloader, if it has one: also after each reset.
-    fn unlock(&self, session: &mut Session<'_>, update: &RunningUpdate<'_>) -> Result<(), Error> {
-        super::of(update.dialect).unlock(session, self.options, self.number).map(drop)
+/// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
+/// From then on it is unlocked.
+fn settled(
+    session: &mut Session<'_>,
+    old: Bootloader,
+    update: &RunningUpdate<'_>,
+) -> Result<Progress, Error> {
+    session.await_idle(old.number, Doing::Installation)?;
+    unlock(session, old.number, update)?;
+    let known =
+        progress(session)?.unwrap_or_else(|| old.running.map(|running| running.progress).unwrap_or_default());
+    if known.state != State::Confirmed {
+        return Ok(known);
     }
+    // No other image is taken before this one is installed.
+    install(session, old.number)?;
+    Ok(progress(session)?.unwrap_or(known))
+}
 
-    /// Waits for an installation that goes on, and ends one that was broken off; what the device reports
-    /// then. From then on it is unlocked.
-    fn settled(
-        &self,
-        session: &mut Session<'_>,
-        old: Bootloader,
-        update: &RunningUpdate<'_>,
-    ) -> Result<Progress, Error> {
-        session.await_idle(self.number, Doing::Installation)?;
-        self.unlock(session, update)?;
-        let known = progress(session)?
-            .unwrap_or_else(|| old.running.map(|running| running.progress).unwrap_or_default());
-        if known.state != State::Confirmed {
-            return Ok(known);
-        }
-        // No other image is taken before this one is installed.
-        install(session, self.number)?;
-        Ok(progress(session)?.unwrap_or(known))
-    }
-
-    /// Ends a trial, whose image takes no other one. The one that comes back is unlocked.
-    fn leave_trial(
-        &self,
-        session: &mut Session<'_>,
-        running: Progress,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<(), Error> {
-        match running {
-            // Without a record, a program has taken its flash.
-            Progress { origin: Origin::Trial, state: State::Staged | State::None, .. } => {
-                match session.command(self.number, ProgramControl::ClrSignature) {
-                    // One that wants a password, for example. Any reset ends its trial.
-                    Err(Error::Refused { .. }) => self.restart(session, update),
-                    Err(error) => Err(error),
-                    Ok(()) => {
-                        let limit = session.timing().boot;
-                        let other = await_other_image(session, limit)?;
-                        let node = session.node();
-                        other.ok_or(Error::NoAnswer { node, doing: Doing::Restart })?;
-                        self.unlock(session, update)
-                    }
+/// Ends a trial, whose image takes no other one. The one that comes back is unlocked.
+fn leave_trial(
+    session: &mut Session<'_>,
+    number: u8,
+    running: Progress,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(), Error> {
+    match running {
+        // Without a record, a program has taken its flash.
+        Progress { origin: Origin::Trial, state: State::Staged | State::None, .. } => {
+            match session.command(number, ProgramControl::ClrSignature) {
+                // One that wants a password, for example. Any reset ends its trial.
+                Err(Error::Refused { .. }) => restart(session, number, update),
+                Err(error) => Err(error),
+                Ok(()) => {
+                    let limit = session.timing().boot;
+                    let other = await_other_image(session, limit)?;
+                    let node = session.node();
+                    other.ok_or(Error::NoAnswer { node, doing: Doing::Restart })?;
+                    unlock(session, number, update)
                 }
             }
-            // It is installed: the next start loads it from home.
-            Progress { origin: Origin::Trial, state: State::Installed, .. } => self.restart(session, update),
-            _ => Ok(()),
         }
+        // It is installed: the next start loads it from home.
+        Progress { origin: Origin::Trial, state: State::Installed, .. } => restart(session, number, update),
+        _ => Ok(()),
     }
+}
 
-    /// Restarts the device, and brings it into its bootloader again.
-    fn restart(&self, session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> Result<(), Error> {
-        session.reset_node()?;
-        session.wait(LEAVES_WITHIN)?;
-        session.talk_to(update.original);
-        let options = FlashOptions { mastership: false, check_target: None, ..*self.options };
-        let called = update.called;
-        let entered =
-            find(session, &options, update).and_then(|found| Renew.enter(session, found, &options, update));
-        // A program that has started by itself meanwhile did not run before.
-        update.called = called;
-        entered?;
-        self.unlock(session, update)
-    }
+/// Restarts the device, and brings it into its bootloader again.
+fn restart(session: &mut Session<'_>, number: u8, update: &mut RunningUpdate<'_>) -> Result<(), Error> {
+    session.reset_node()?;
+    session.wait(LEAVES_WITHIN)?;
+    session.talk_to(update.original);
+    let (called, options) = (update.called, update.options);
+    // The tool has what it wants of the master, and knows the device.
+    update.options = FlashOptions { mastership: false, check_target: None, ..options };
+    let entered = find(session, update).and_then(|found| Renew.enter(session, found, update));
+    // A program that has started by itself meanwhile did not run before.
+    (update.called, update.options) = (called, options);
+    entered?;
+    unlock(session, number, update)
+}
 
-    /// Downloads the image into staging; returns the number of repetitions.
-    fn stage(
-        &self,
-        session: &mut Session<'_>,
-        file: &Payload,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<u32, Error> {
-        let number = self.number;
-        let content = file.encoded(super::encode::raw);
-        let prepare = |session: &mut Session<'_>, _: &mut RunningUpdate<'_>| {
-            execute(session, number, ProgramControl::Clear)
-        };
-        let (doing, status) = (Doing::Bootloader, whole::idle);
-        let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-        whole::send(session, &whole, self.options, update)
-    }
+/// Downloads the image into staging; returns the number of repetitions.
+fn stage(
+    session: &mut Session<'_>,
+    number: u8,
+    file: &Payload,
+    update: &mut RunningUpdate<'_>,
+) -> Result<u32, Error> {
+    let content = file.encoded(Form::Image);
+    let prepare = |session: &mut Session<'_>, _: &mut RunningUpdate<'_>| {
+        execute(session, number, ProgramControl::Clear)
+    };
+    let (doing, status) = (Doing::Bootloader, whole::idle);
+    let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
+    whole::send(session, &whole, update)
 }
 
 /// Whether the device runs this image. A sealed image is judged by the device.

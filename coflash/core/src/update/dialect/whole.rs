@@ -11,7 +11,6 @@ use crate::device::{Doing, Error, Session, Timing, Transfers};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
-use crate::update::options::FlashOptions;
 use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
@@ -44,13 +43,12 @@ pub(super) fn download(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
     crcs: [u32; 2],
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
     let began = session.now();
     let before = steps::told_before(session, whole.number)?;
     update.erases(before);
-    let repeats = send(session, whole, options, update)?;
+    let repeats = send(session, whole, update)?;
     let took = session.now().saturating_sub(began);
     update.state = DeviceState::Written;
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
@@ -68,7 +66,6 @@ pub(super) fn download(
 pub(super) fn send(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
-    options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
     let Whole { number, content, doing, .. } = *whole;
@@ -106,12 +103,12 @@ pub(super) fn send(
             Judgement::Bad { why, error } => (why, error),
         };
         match why {
-            Some(why) if repeat < options.repeats => {
+            Some(why) if repeat < update.options.repeats => {
                 repeat += 1;
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }
-                update.tell(Event::Retry(Retry::program(repeat, options.repeats, why)));
+                update.tell(Event::Retry(Retry::program(repeat, update.options.repeats, why)));
             }
             _ => return Err(error),
         }

@@ -10,7 +10,7 @@ use coboot_can::AdapterError;
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
-use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Report};
+use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Report};
 use coflash_core::Error;
 
 use super::left;
@@ -92,11 +92,18 @@ impl Adapter for Beside {
     }
 }
 
+fn program() -> Payload {
+    block_file::read(data!("identity-110.blk")).unwrap().into()
+}
+
 fn run(adapter: &mut dyn Adapter) -> (Result<Report, Error>, Vec<Event>) {
-    let file = block_file::read(data!("identity-110.blk")).unwrap();
+    run_with(adapter, &program())
+}
+
+fn run_with(adapter: &mut dyn Adapter, file: &Payload) -> (Result<Report, Error>, Vec<Event>) {
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
-    let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
+    let result = flash(&mut session, file, &FlashOptions::default(), &mut |event| events.push(event));
     (result, events)
 }
 
@@ -124,15 +131,18 @@ fn a_master_that_starts_the_node_ends_no_update() {
 }
 
 /// A master that never ends, and another tool that waits for the end of an erase: the program that
-/// was called back starts again, and the tool says why.
+/// was called back starts again, and the tool says why. A new bootloader is no exception.
 #[test]
 fn who_goes_on_asking_after_the_call_back_is_told_and_the_program_starts_again() {
-    for (waits, pause) in [(0, 20), (100, 20), (0, 250), (250, 250)] {
+    let (program, new) = (program(), super::renew::new());
+    for (waits, pause, file) in
+        [(0, 20, &program), (100, 20, &program), (0, 250, &program), (250, 250, &program), (0, 20, &new)]
+    {
         let mut fake = Fake::new(APPLICATION);
         fake.restart_time = ms(50);
         let mut bus = Beside::new(fake, ms(waits), ms(pause), true);
         let began = bus.now();
-        let (result, events) = run(&mut bus);
+        let (result, events) = run_with(&mut bus, file);
         let error = result.unwrap_err();
         assert_eq!(error.number(), 0x6000_0012, "{error}");
         let words = "another tool is using node 5: it sends SDO requests, the last one for 10";
@@ -148,12 +158,13 @@ fn who_goes_on_asking_after_the_call_back_is_told_and_the_program_starts_again()
 /// Another tool that commands the bootloader has the device: it is left to it.
 #[test]
 fn who_commands_the_bootloader_has_the_device() {
-    for waits in [0, 100, 250] {
+    let (program, new) = (program(), super::renew::new());
+    for (waits, file) in [(0, &program), (100, &program), (250, &program), (100, &new)] {
         let mut fake = Fake::new(APPLICATION);
         fake.restart_time = ms(50);
         let mut bus = Beside::new(fake, ms(waits), ms(1), false);
         bus.requests = vec![CLEAR];
-        let error = run(&mut bus).0.unwrap_err();
+        let error = run_with(&mut bus, file).0.unwrap_err();
         let words = "another tool is using node 5: it sends SDO requests, the last one for 1F51h/1";
         assert_eq!(error.to_string(), words);
         assert_eq!(bus.fake.writes(), ["command 80", "command 03"]);

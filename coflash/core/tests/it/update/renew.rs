@@ -18,7 +18,7 @@ use shared_abi::ram_image::Version;
 use kit::fake::renewal::*;
 use kit::fake::{Bus, Fake, APPLICATION, BOOTLOADER, NODE};
 
-fn new() -> Payload {
+pub fn new() -> Payload {
     let image = raw::read(&image(NEW), Some(0x0801_0000)).unwrap();
     RamImage::find(&image).unwrap().into()
 }
