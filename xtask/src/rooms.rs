@@ -47,14 +47,14 @@ const BOOT_CORE: &[Rule] = &[
 /// The rooms of `coflash-core`. A new room needs a row. `update` uses `coboot_can` for several devices at
 /// once, which share an adapter.
 const COFLASH: &[Rule] = &[
-    ("setters", ""),
+    ("options", ""),
     ("unicode", ""),
     ("json", "canopen"),
     ("advice", "canopen"),
-    ("file", "advice setters shared_abi unicode"),
-    ("device", "advice canopen coboot_can json setters shared_abi unicode"),
-    ("update", "advice canopen coboot_can device file json setters shared_abi"),
-    ("machine", "canopen coboot_can device file json setters shared_abi update"),
+    ("file", "advice options shared_abi unicode"),
+    ("device", "advice canopen coboot_can json options shared_abi unicode"),
+    ("update", "advice canopen coboot_can device file json options shared_abi"),
+    ("machine", "canopen coboot_can device file json options shared_abi update"),
 ];
 
 /// The dependencies of `coflash-core` that a room may use only if its row lists them.

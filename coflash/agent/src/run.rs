@@ -44,69 +44,38 @@ pub struct Order<'o> {
     pub kept: bool,
 }
 
-/// The options of a run.
-#[derive(Clone, Debug, Default)]
-#[non_exhaustive]
-pub struct Options {
-    /// End when each device has nothing to do before its next poll.
-    pub once: bool,
-    /// The seed of the jitter.
-    pub seed: u64,
-    /// The time limits.
-    pub times: Times,
-    /// Ends the run when it is set.
-    pub cancelled: Arc<AtomicBool>,
-}
-
-impl Options {
-    coflash_core::setters! {
-        once: bool,
-        seed: u64,
-        times: Times,
-        cancelled: Arc<AtomicBool>,
+coflash_core::options! {
+    /// The options of a run.
+    #[derive(Clone, Debug)]
+    pub struct Options {
+        /// End when each device has nothing to do before its next poll.
+        pub once: bool = false,
+        /// The seed of the jitter.
+        pub seed: u64 = 0,
+        /// The time limits.
+        pub times: Times = Times::default(),
+        /// Ends the run when it is set.
+        pub cancelled: Arc<AtomicBool> = Arc::default(),
     }
 }
 
-/// The time limits of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct Times {
-    /// The first pause after a failure; each further one is twice as long.
-    pub backoff_first: Duration,
-    /// The longest pause after a failure.
-    pub backoff_most: Duration,
-    /// The shortest pause between two messages of progress.
-    pub tell: Duration,
-    /// How long a server may send nothing.
-    pub silent: Duration,
-    /// How long a request may take, apart from files.
-    pub request: Duration,
-    /// How long a file is fetched until the agent looks after other things, if the server can go on
-    /// where it ended.
-    pub piece: Duration,
-}
-
-impl Times {
-    coflash_core::setters! {
-        backoff_first: Duration,
-        backoff_most: Duration,
-        tell: Duration,
-        silent: Duration,
-        request: Duration,
-        piece: Duration,
-    }
-}
-
-impl Default for Times {
-    fn default() -> Self {
-        Self {
-            backoff_first: Duration::from_secs(5),
-            backoff_most: Duration::from_secs(300),
-            tell: Duration::from_secs(5),
-            silent: Duration::from_secs(20),
-            request: Duration::from_secs(30),
-            piece: Duration::from_secs(60),
-        }
+coflash_core::options! {
+    /// The time limits of a run.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub struct Times {
+        /// The first pause after a failure; each further one is twice as long.
+        pub backoff_first: Duration = Duration::from_secs(5),
+        /// The longest pause after a failure.
+        pub backoff_most: Duration = Duration::from_secs(300),
+        /// The shortest pause between two messages of progress.
+        pub tell: Duration = Duration::from_secs(5),
+        /// How long a server may send nothing.
+        pub silent: Duration = Duration::from_secs(20),
+        /// How long a request may take, apart from files.
+        pub request: Duration = Duration::from_secs(30),
+        /// How long a file is fetched until the agent looks after other things, if the server can
+        /// go on where it ended.
+        pub piece: Duration = Duration::from_secs(60),
     }
 }
 

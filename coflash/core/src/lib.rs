@@ -6,8 +6,8 @@
 //! | [`advice`] | what to do next, after an error or in mid-update | |
 //! | [`file`](mod@file) | firmware files: read, checked, converted | `advice` |
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `advice` |
-//! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `advice`, `device`, `file` |
-//! | [`machine`] | a package with the programs of a whole machine: its file, the plan for a bus, the update | `device`, `file`, `update` |
+//! | [`update`] | the procedure, a file for each dialect, many devices at once | `advice`, `device`, `file` |
+//! | [`machine`] | a package with the programs of a whole machine: its recipe and file, the plan for a bus, the update | `device`, `file`, `update` |
 //!
 //! The page in the browser, the update agent, the conformance checks and the command line are crates
 //! beside this one (`coflash-ui`, `coflash-agent`, `coflash-conform`, `coflash`) and use it as every
@@ -37,7 +37,7 @@
 
 mod json;
 #[macro_use]
-mod setters;
+mod options;
 mod unicode;
 
 pub mod advice;

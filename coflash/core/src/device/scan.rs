@@ -29,43 +29,22 @@ pub struct Found {
     pub but: Option<String>,
 }
 
-/// Options of a scan.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct ScanOptions {
-    /// The node-IDs to ask.
-    pub nodes: Vec<NodeId>,
-    /// How long to listen for messages that nodes send by themselves; in most networks, heartbeats
-    /// come once a second.
-    pub listen: Duration,
-    /// The time limits.
-    pub timing: Timing,
-    /// Whether to send requests.
-    pub ask: bool,
-    /// Whether to listen first, and to ask nobody while another tool sends SDO requests: those of a scan would
-    /// break its transfer.
-    pub alone: bool,
-}
-
-impl ScanOptions {
-    setters! {
-        nodes: Vec<NodeId>,
-        listen: Duration,
-        timing: Timing,
-        ask: bool,
-        alone: bool,
-    }
-}
-
-impl Default for ScanOptions {
-    fn default() -> Self {
-        Self {
-            nodes: (1..=127).filter_map(NodeId::new).collect(),
-            listen: Duration::from_millis(1100),
-            timing: Timing::default(),
-            ask: true,
-            alone: false,
-        }
+options! {
+    /// Options of a scan.
+    #[derive(Clone, Debug)]
+    pub struct ScanOptions {
+        /// The node-IDs to ask.
+        pub nodes: Vec<NodeId> = (1..=127).filter_map(NodeId::new).collect(),
+        /// How long to listen for messages that nodes send by themselves; in most networks,
+        /// heartbeats come once a second.
+        pub listen: Duration = Duration::from_millis(1100),
+        /// The time limits.
+        pub timing: Timing = Timing::default(),
+        /// Whether to send requests.
+        pub ask: bool = true,
+        /// Whether to listen first, and to ask nobody while another tool sends SDO requests: those
+        /// of a scan would break its transfer.
+        pub alone: bool = false,
     }
 }
 

@@ -118,42 +118,33 @@ impl Label {
     }
 }
 
-/// The options of a conversion. The default is the manual's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct Options {
-    /// The region of the program.
-    pub region: Region,
-    /// The size of the largest block, including framing; it must fit into the bootloader's buffer.
-    pub block_size: usize,
-    /// The value that fills gaps inside a block.
-    pub gap_fill: GapFill,
-    /// The contents of block 0.
-    pub label: Label,
-    /// The offset that is added to every address, after [`Region::Cut`] and before
-    /// [`Region::Strict`]; 2³² − n subtracts n.
-    pub adjust_start: u32,
-    /// The CRC of blocks and program: the one that the bootloader was built for.
-    pub checksum: Checksum,
-    /// The longest gap inside a block, in bytes (manual L-1112e_5, `FT_BLOCK_MAX_GAP`): a longer
-    /// gap starts a new block. `None`: the room in the block is the only limit.
-    pub max_gap: Option<u32>,
-    /// The form of the last block.
-    pub last_block: LastBlock,
+options! {
+    /// The options of a conversion. The default is the manual's.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub struct Options {
+        /// The region of the program.
+        pub region: Region = Region::default(),
+        /// The size of the largest block, including framing; it must fit into the bootloader's
+        /// buffer.
+        pub block_size: usize = DEFAULT_BLOCK_SIZE,
+        /// The value that fills gaps inside a block.
+        pub gap_fill: GapFill = GapFill::default(),
+        /// The contents of block 0.
+        pub label: Label = Label::default(),
+        /// The offset that is added to every address, after [`Region::Cut`] and before
+        /// [`Region::Strict`]; 2³² − n subtracts n.
+        pub adjust_start: u32 = 0,
+        /// The CRC of blocks and program: the one that the bootloader was built for.
+        pub checksum: Checksum = Checksum::default(),
+        /// The longest gap inside a block, in bytes (manual L-1112e_5, `FT_BLOCK_MAX_GAP`): a
+        /// longer gap starts a new block. `None`: the room in the block is the only limit.
+        pub max_gap: Option<u32> = None,
+        /// The form of the last block.
+        pub last_block: LastBlock = LastBlock::default(),
+    }
 }
 
 impl Options {
-    setters! {
-        region: Region,
-        block_size: usize,
-        gap_fill: GapFill,
-        label: Label,
-        adjust_start: u32,
-        checksum: Checksum,
-        max_gap: Option<u32>,
-        last_block: LastBlock,
-    }
-
     /// The address of a raw binary, if the region gives it: the file begins at the start of the region. The
     /// conversion adjusts it like any other address.
     #[must_use]
@@ -162,21 +153,6 @@ impl Options {
             Region::Unknown | Region::CutBehind(_) => None,
             Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
             Region::Cut(range) => Some(range.first),
-        }
-    }
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            region: Region::default(),
-            block_size: DEFAULT_BLOCK_SIZE,
-            gap_fill: GapFill::default(),
-            label: Label::default(),
-            adjust_start: 0,
-            checksum: Checksum::default(),
-            max_gap: None,
-            last_block: LastBlock::default(),
         }
     }
 }

@@ -17,20 +17,14 @@ use crate::update::many::{self, flash_many, Failed, Job, ManyOptions};
 use crate::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report};
 use coboot_can::Adapter;
 
-/// The options of a run.
-#[derive(Clone, Debug, Default)]
-#[non_exhaustive]
-pub struct RunOptions {
-    /// The options for all devices. What the package says wins.
-    pub flash: FlashOptions,
-    /// How devices with the same program are updated at the same time.
-    pub many: ManyOptions,
-}
-
-impl RunOptions {
-    setters! {
-        flash: FlashOptions,
-        many: ManyOptions,
+options! {
+    /// The options of a run.
+    #[derive(Clone, Debug)]
+    pub struct RunOptions {
+        /// The options for all devices. What the package says wins.
+        pub flash: FlashOptions = FlashOptions::default(),
+        /// How devices with the same program are updated at the same time.
+        pub many: ManyOptions = ManyOptions::default(),
     }
 }
 

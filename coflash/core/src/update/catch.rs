@@ -23,21 +23,15 @@ const ANYBODY: [u8; 8] = [0x4C, 0, 0, 0, 0, 0, 0, 0];
 /// The answer.
 const NOBODY_YET: u8 = 0x50;
 
-/// The device to catch, and the time limit.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct CatchOptions {
-    /// Catch any device, not only the node of the session. The requests are then a layer setting
-    /// service, which holds every device that starts meanwhile in its bootloader.
-    pub any: bool,
-    /// Give up after this time; `None` for no limit.
-    pub within: Option<Duration>,
-}
-
-impl CatchOptions {
-    setters! {
-        any: bool,
-        within: Option<Duration>,
+options! {
+    /// The device to catch, and the time limit.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    pub struct CatchOptions {
+        /// Catch any device, not only the node of the session. The requests are then a layer
+        /// setting service, which holds every device that starts meanwhile in its bootloader.
+        pub any: bool = false,
+        /// Give up after this time; `None` for no limit.
+        pub within: Option<Duration> = None,
     }
 }
 

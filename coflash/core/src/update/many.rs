@@ -36,45 +36,24 @@ impl Job {
     }
 }
 
-/// The options for all updates.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct ManyOptions {
-    /// The time limits. Requests wait for those to other devices: with several devices at the
-    /// same time, the SDO time-out of a block is multiplied by their number, and that of other
-    /// requests is doubled outside of a group.
-    pub timing: Timing,
-    /// The form of downloads.
-    pub transfers: Transfers,
-    /// How many devices are updated at the same time. A device that waits for its group does not
-    /// count.
-    pub at_once: usize,
-    /// Whether devices that can are updated together: data blocks go to all of them in one
-    /// download.
-    pub together: bool,
-    /// Ends all updates when it is set.
-    pub cancelled: Arc<AtomicBool>,
-}
-
-impl ManyOptions {
-    setters! {
-        timing: Timing,
-        transfers: Transfers,
-        at_once: usize,
-        together: bool,
-        cancelled: Arc<AtomicBool>,
-    }
-}
-
-impl Default for ManyOptions {
-    fn default() -> Self {
-        Self {
-            timing: Timing::default(),
-            transfers: Transfers::default(),
-            at_once: 8,
-            together: true,
-            cancelled: Arc::default(),
-        }
+options! {
+    /// The options for all updates.
+    #[derive(Clone, Debug)]
+    pub struct ManyOptions {
+        /// The time limits. Requests wait for those to other devices: with several devices at the
+        /// same time, the SDO time-out of a block is multiplied by their number, and that of other
+        /// requests is doubled outside of a group.
+        pub timing: Timing = Timing::default(),
+        /// The form of downloads.
+        pub transfers: Transfers = Transfers::default(),
+        /// How many devices are updated at the same time. A device that waits for its group does
+        /// not count.
+        pub at_once: usize = 8,
+        /// Whether devices that can are updated together: data blocks go to all of them in one
+        /// download.
+        pub together: bool = true,
+        /// Ends all updates when it is set.
+        pub cancelled: Arc<AtomicBool> = Arc::default(),
     }
 }
 

@@ -7,7 +7,7 @@ use shared_abi::layout::Layout;
 
 use super::dialect::is_data;
 use super::payload::Payload;
-use crate::device::Dialect;
+use crate::device::{Dialect, Form};
 use crate::file::convert::{program_of, ConvertError, Options, Region};
 use crate::file::inspect::Inspection;
 use crate::file::sealed::{blocks, carried, Refusal, SealedFile};
@@ -25,26 +25,30 @@ pub enum Judging {
     Nothing,
 }
 
-/// What is known of the device, and chosen about a file for it.
-#[derive(Clone, Copy, Debug)]
-#[non_exhaustive]
-pub struct Reading {
-    /// The program number: sub-index of 1F50h.
-    pub program: u8,
-    /// The format, in place of that of the first bytes and the name. A sealed image is one in any format.
-    pub format: Option<Format>,
-    /// The address of a raw binary, in place of the start of the board's region.
-    pub address: Option<u32>,
-    /// The memory map of the device: the program must lie in its region there.
-    pub board: Option<&'static Layout>,
-    /// The dialect of the device. `None` if it is found later: then a program above 1 may be data.
-    pub dialect: Option<Dialect>,
-    /// How a program is made of the memory contents. The board's region takes the place of the one in here.
-    pub convert: Options,
-    /// How the file is judged.
-    pub judging: Judging,
-    /// Whether the contents are described, for people.
-    pub inspect: bool,
+options! {
+    /// What is known of the device, and chosen about a file for it.
+    #[derive(Clone, Copy, Debug)]
+    pub struct Reading {
+        /// The program number: sub-index of 1F50h.
+        pub program: u8 = 1,
+        /// The format, in place of that of the first bytes and the name. A sealed image is one in
+        /// any format.
+        pub format: Option<Format> = None,
+        /// The address of a raw binary, in place of the start of the board's region.
+        pub address: Option<u32> = None,
+        /// The memory map of the device: the program must lie in its region there.
+        pub board: Option<&'static Layout> = None,
+        /// The dialect of the device. `None` if it is found later: then a program above 1 may be
+        /// data.
+        pub dialect: Option<Dialect> = None,
+        /// How a program is made of the memory contents. The board's region takes the place of the
+        /// one in here.
+        pub convert: Options = Options::default(),
+        /// How the file is judged.
+        pub judging: Judging = Judging::default(),
+        /// Whether the contents are described, for people.
+        pub inspect: bool = false,
+    }
 }
 
 /// A file that was read for a device.
@@ -95,26 +99,7 @@ impl Reading {
     /// Reading for this program number, with nothing else known.
     #[must_use]
     pub fn new(program: u8) -> Self {
-        Self {
-            program,
-            format: None,
-            address: None,
-            board: None,
-            dialect: None,
-            convert: Options::default(),
-            judging: Judging::default(),
-            inspect: false,
-        }
-    }
-
-    setters! {
-        format: Option<Format>,
-        address: Option<u32>,
-        board: Option<&'static Layout>,
-        dialect: Option<Dialect>,
-        convert: Options,
-        judging: Judging,
-        inspect: bool,
+        Self { program, ..Self::default() }
     }
 
     /// Reads a file with this name: a bootloader, a sealed image, also one in blocks, or a program.
@@ -133,7 +118,7 @@ impl Reading {
         let convert = self.convert.region(self.region()?);
         let raw_address = self.address.or_else(|| convert.raw_address()).or_else(|| {
             // These take an image without addresses.
-            matches!(self.dialect, Some(Dialect::Raw | Dialect::Lift)).then_some(0)
+            self.dialect.filter(|dialect| dialect.form() == Form::Image).map(|_| 0)
         });
         let firmware = read::read(bytes, format, raw_address).map_err(ContentFault::File)?;
         let described = format.filter(|_| self.inspect);
