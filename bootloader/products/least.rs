@@ -4,17 +4,14 @@ use super::*;
 
 /// The choices of this product.
 pub const PRODUCT: Product = Product {
-    autostart: Autostart::List(&[]),
-    rescue_window_ms: 0,
-    auto_bit_rate: false,
-    boot_up_emergency: false,
-    watchdog_ms: None,
-    renewal: false,
-    lss: false,
-    crystal_failure: CrystalFailure::RunFromHsi,
-    block_download: false,
-    block_upload: false,
-    second_server: false,
-    resume: false,
+    autostart: None,
+    node: Node { auto_bit_rate: false, ..Node::DEFAULT },
+    nmt: Nmt { boot_up_emergency: false, ..Nmt::DEFAULT },
+    watchdog: Watchdog { bootloader_ms: None, ..Watchdog::DEFAULT },
+    renewal: None,
+    lss: None,
+    sdo: Sdo { block_upload: false, ..Sdo::DEFAULT },
+    block_download: None,
+    download: Download { resume: false, ..Download::DEFAULT },
     ..Product::DEFAULT
 };

@@ -5,24 +5,25 @@ use super::*;
 
 /// The choices of this product.
 pub const PRODUCT: Product = Product {
-    node_source: NodeSource::Function(|| {
-        // Seven switches for the node-ID, four for the bit rate.
-        let switches = bsp::inputs('E');
-        ((switches >> 8) as u8 & 0x7F, (switches >> 4) as u8 & 0xF)
-    }),
-    start_allowed: |_| bsp::inputs('C') & 1 != 0,
-    node_ids: 2..=100,
-    bit_rates: 2..=6,
-    boot_up_message: false,
-    boot_up_emergency: false,
-    sdo_request_base: 0x300,
-    sdo_response_base: 0x480,
-    segments_per_sub_block: 20,
-    receive_queue: 8,
-    lss_start_in_configuration: true,
-    lss_announce: true,
-    lss_store: false,
-    identity: IdentitySource::Otp,
-    erase: Some(|_| Erase::AtOnce),
+    node: Node {
+        source: NodeSource::Function(|| {
+            // Seven switches for the node-ID, four for the bit rate.
+            let switches = bsp::inputs('E');
+            ((switches >> 8) as u8 & 0x7F, (switches >> 4) as u8 & 0xF)
+        }),
+        ids: 2..=100,
+        bit_rates: 2..=6,
+        ..Node::DEFAULT
+    },
+    nmt: Nmt { boot_up_message: false, boot_up_emergency: false, ..Nmt::DEFAULT },
+    sdo: Sdo { request_base: 0x300, response_base: 0x480, receive_queue: 8, ..Sdo::DEFAULT },
+    block_download: Some(BlockDownload { segments_per_sub_block: 20, ..BlockDownload::DEFAULT }),
+    lss: Some(Lss { start_in_configuration: true, announce: true, store: false, ..Lss::DEFAULT }),
+    identity: Identity { source: IdentitySource::Otp, ..Identity::DEFAULT },
+    hooks: Hooks {
+        erase: Some(|_| Erase::AtOnce),
+        start_allowed: |_| bsp::inputs('C') & 1 != 0,
+        ..Hooks::DEFAULT
+    },
     ..Product::DEFAULT
 };

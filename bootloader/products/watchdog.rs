@@ -3,4 +3,5 @@
 use super::*;
 
 /// The choices of this product.
-pub const PRODUCT: Product = Product { program_watchdog_ms: Some(1000), ..Product::DEFAULT };
+pub const PRODUCT: Product =
+    Product { watchdog: Watchdog { program_ms: Some(1000), ..Watchdog::DEFAULT }, ..Product::DEFAULT };

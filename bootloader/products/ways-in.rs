@@ -3,4 +3,5 @@
 use super::*;
 
 /// The choices of this product.
-pub const PRODUCT: Product = Product { two_resets: true, rom_loader: true, ..Product::DEFAULT };
+pub const PRODUCT: Product =
+    Product { ways_in: WaysIn { two_resets: true, rom_loader: true }, ..Product::DEFAULT };

@@ -3,4 +3,4 @@
 use super::*;
 
 /// The choices of this product.
-pub const PRODUCT: Product = Product { renewal: false, ..Product::DEFAULT };
+pub const PRODUCT: Product = Product { renewal: None, ..Product::DEFAULT };

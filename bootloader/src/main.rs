@@ -75,14 +75,16 @@ mod app {
 
     /// Frames that can wait for the protocol task. The task has a higher priority than all work
     /// that takes long, so only few frames wait.
-    const RX_QUEUE: usize = PRODUCT.receive_queue as usize;
+    const RX_QUEUE: usize = PRODUCT.sdo.receive_queue as usize;
     /// Period in which the protocol checks its deadlines, in ms.
     const TICK_MS: u32 = 2;
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
     /// The same with the bootloader itself, if it can be renewed.
-    const IMAGES: usize = PROGRAMS + PRODUCT.renewal as usize;
+    const IMAGES: usize = PROGRAMS + product::RENEWS as usize;
     const EXTRAS: Extras = PRODUCT.extras();
+    const LSS: product::Lss = PRODUCT.lss_or_default();
+    const BLOCK_DOWNLOAD: product::BlockDownload = PRODUCT.block_download_or_default();
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
     static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
 
@@ -96,7 +98,7 @@ mod app {
             hardware_version: IDENTITY.hardware_version,
             // The version, and the product if it is not the default one (build.rs).
             software_version: env!("COBOOT_VERSION"),
-            heartbeat_ms: PRODUCT.heartbeat_ms,
+            heartbeat_ms: PRODUCT.nmt.heartbeat_ms,
             vendor_id: IDENTITY.vendor_id,
             product_code: IDENTITY.product_code,
             revision: IDENTITY.revision,
@@ -105,8 +107,8 @@ mod app {
         node_id: PRODUCT.profile.node_id,
         layout: LAYOUT,
         supports: product::supports,
-        boot_up_emergency: PRODUCT.boot_up_emergency,
-        download: PRODUCT.download(&product::BOARD, &RENEWAL),
+        boot_up_emergency: PRODUCT.nmt.boot_up_emergency,
+        download: PRODUCT.download_policy(&product::BOARD, &RENEWAL),
         password: PRODUCT.profile.password,
     };
 
@@ -121,14 +123,14 @@ mod app {
 
     impl Choices for Chosen {
         const EXTRAS: Extras = EXTRAS;
-        const INTEL_HEX: bool = PRODUCT.intel_hex;
-        const BLOCK_DOWNLOAD: bool = PRODUCT.block_download;
-        const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
-        const LSS: bool = PRODUCT.lss;
-        const LSS_IDENTIFY: bool = PRODUCT.lss_identify;
-        const LSS_STORE: bool = PRODUCT.lss_store;
-        const DETECTS_BIT_RATE: bool = PRODUCT.auto_bit_rate;
-        const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;
+        const INTEL_HEX: bool = PRODUCT.download.intel_hex;
+        const BLOCK_DOWNLOAD: bool = PRODUCT.block_download.is_some();
+        const BLOCK_UPLOAD: bool = PRODUCT.sdo.block_upload;
+        const LSS: bool = PRODUCT.lss.is_some();
+        const LSS_IDENTIFY: bool = LSS.identify;
+        const LSS_STORE: bool = LSS.store;
+        const DETECTS_BIT_RATE: bool = PRODUCT.node.auto_bit_rate;
+        const NODE_IDS: RangeInclusive<u8> = PRODUCT.node.ids;
         const PROGRAM_START: ProgramStart = product::PROGRAM_START;
     }
 
@@ -175,13 +177,13 @@ mod app {
             let Nameplate { vendor_id, product_code, revision, .. } = *device;
             self.config.write(bootloader::Config {
                 device: Device { vendor_id, product_code, revision, ..CONFIG.device },
-                download: PRODUCT.download(device, renewal),
+                download: PRODUCT.download_policy(device, renewal),
                 ..CONFIG
             })
         }
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [SealedMemory; product::SEALED as usize] = [const { SealedMemory::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS]), own: [Own; product::HAS_NAMEPLATE as usize] = [const { Own::NONE }; product::HAS_NAMEPLATE as usize]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.download.block_buffer] = [0; PRODUCT.download.block_buffer], room: [SealedMemory; product::SEALED as usize] = [const { SealedMemory::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS]), own: [Own; product::HAS_NAMEPLATE as usize] = [const { Own::NONE }; product::HAS_NAMEPLATE as usize]])]
     fn init(mut cx: init::Context) -> (Shared, Local) {
         // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
@@ -205,22 +207,19 @@ mod app {
         };
         let slave_config = slave::Config {
             node: node::Config {
-                boot_up: PRODUCT.boot_up_message,
-                heartbeat_ms: PRODUCT.heartbeat_ms,
+                boot_up: PRODUCT.nmt.boot_up_message,
+                heartbeat_ms: PRODUCT.nmt.heartbeat_ms,
                 nmt: NmtPolicy::StayPreOperational,
                 sdo: SdoConfig {
                     unknown_request: PRODUCT.profile.unknown_request,
-                    request_base: PRODUCT.sdo_request_base,
-                    response_base: PRODUCT.sdo_response_base,
-                    blksize: PRODUCT.segments_per_sub_block,
+                    request_base: PRODUCT.sdo.request_base,
+                    response_base: PRODUCT.sdo.response_base,
+                    blksize: BLOCK_DOWNLOAD.segments_per_sub_block,
                     ..SdoConfig::DEFAULT
                 },
             },
-            lss: lss::Config {
-                start_in_configuration: PRODUCT.lss_start_in_configuration,
-                announce: PRODUCT.lss_announce,
-            },
-            is_silent: clock == Source::Internal && PRODUCT.crystal_failure == CrystalFailure::Silent,
+            lss: lss::Config { start_in_configuration: LSS.start_in_configuration, announce: LSS.announce },
+            is_silent: clock == Source::Internal && LSS.crystal_failure == CrystalFailure::Silent,
         };
         let nameplate = product::nameplate();
         let config = match (cx.local.own.first_mut(), &nameplate) {
@@ -349,7 +348,7 @@ mod app {
             }
             if let Some(request) = bootloader.take_boot_request() {
                 // A trial ends also if nobody acknowledges a frame: the bit rate of the image may be wrong.
-                let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);
+                let ends = product::RENEWS && request == BootRequest::Renewal(TrialStep::Late);
                 *pending_reset = PendingReset { wanted: true, request, at: ends.then_some(now) };
             }
             (bootloader.is_finishing(), bootloader.is_compacting())
@@ -366,7 +365,7 @@ mod app {
         }
         // The stored values that were reported to a host must not be lost by an early reset.
         if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
-            pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
+            pending_reset.at = Some(now + PRODUCT.nmt.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
             log!("longest between two feeds; us", log::feeds::longest());
         }

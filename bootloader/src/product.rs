@@ -1,9 +1,8 @@
-//! The choices that a product has. A product makes them in its file, `products/default.rs`.
+//! The choices that a product has. A product makes them in its file, `products/default.rs`; the table of all
+//! of them is `choices.rs`.
 //!
 //! A library of its own: the resident part and the RAM image are both built from it, and the tests on the
-//! host read it. Names in brackets are those of the
-//! SYS TEC manual (L-1112d_10, chapter 4.8). If choices contradict each other, the build fails with
-//! the names of the choices.
+//! host read it. If choices contradict each other, the build fails, names them, and says what to write.
 #![no_std]
 
 use core::ops::RangeInclusive;
@@ -18,7 +17,7 @@ pub use boot_core::profile::Profile;
 use boot_core::bootloader::{Extras, PasswordObject};
 use boot_core::canopen::program::ProgramStart;
 use boot_core::canopen::AbortCode;
-use boot_core::control::{Policy, Renewal};
+use boot_core::control::{self, Policy};
 use boot_core::decision;
 use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
@@ -38,11 +37,20 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 /// Whether the bootloader takes sealed images.
 pub const SEALED: bool = cfg!(feature = "sealed");
 
+/// Whether the board has the split map.
+pub const SPLIT: bool = LAYOUT.home.is_some();
+
+/// Whether the board's layout has staging, where a new bootloader waits.
+pub const STAGING: bool = LAYOUT.staging.is_some();
+
+/// Whether the bootloader itself can be renewed.
+pub const RENEWS: bool = PRODUCT.renewal.is_some();
+
 /// The abilities of the resident part, which the RAM image needs.
 pub const ABILITIES: Abilities = Abilities::NONE
     .with(Abilities::SEALED, SEALED)
-    .with(Abilities::RENEWAL, PRODUCT.renewal)
-    .with(Abilities::ROM_LOADER, PRODUCT.rom_loader)
+    .with(Abilities::RENEWAL, RENEWS)
+    .with(Abilities::ROM_LOADER, PRODUCT.ways_in.rom_loader)
     .with(Abilities::NAMEPLATE, HAS_NAMEPLATE);
 
 /// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
@@ -56,219 +64,57 @@ pub enum CrystalFailure {
     RunFromHsi,
 }
 
-/// The choices of a product.
-#[derive(Clone, Debug)]
-pub struct Product {
-    /// The dialect of the product, where dialects contradict each other (docs/dialects.md).
-    pub profile: Profile,
-    /// The programs that start by themselves after a reset, the preferred one first: the device starts the
-    /// first one that is valid, released and allowed. An empty list for a device that waits for 1F51h = 1
-    /// (`BLCOP_USE_AUTOSTART_APP`). Programs count from 1, as sub-indices do: the manual's
-    /// `BLCOP_APP_START_INDEX` = 0 is program 1 here.
-    pub autostart: Autostart,
-    /// The number of unrequested resets of the application in a row after which the device stays in
-    /// the bootloader, 1 to 255.
-    pub max_crash_resets: u32,
-    /// How long a program that was never confirmed is held back before it starts by itself, in ms.
-    /// In this time an SDO request to the node or any layer setting service keeps the device in the
-    /// bootloader. 0 for no such window.
-    pub rescue_window_ms: u16,
-    /// The same for a confirmed program.
-    pub rescue_window_confirmed_ms: u16,
-    /// Whether two resets by the NRST pin within half a second keep the device in the bootloader: an entry
-    /// without a pin of its own. A program then starts half a second later after such a reset.
-    pub two_resets: bool,
-    /// Whether a command over CAN (2008h) starts the loader in the ROM of the chip, ST's own. Who may write a
-    /// program may then do anything with the device: not with the feature `sealed`.
-    pub rom_loader: bool,
-    /// Node-IDs with which programs may be started (`BLCOP_MIN_NODEID`, `BLCOP_MAX_NODEID`).
-    pub node_ids: RangeInclusive<u8>,
-    /// Bit rates that the device may be set to, as indices of CiA 305 table 1: 0 for 1 Mbit/s to 8
-    /// for 10 kbit/s (`BLCOP_MIN_BAUIDX`, `BLCOP_MAX_BAUIDX`).
-    pub bit_rates: RangeInclusive<u8>,
-    /// The source of node-ID and bit rate (`TgtGetNodeId`).
-    pub node_source: NodeSource,
-    /// Whether the node sends a boot-up message (`BLCOP_SEND_BOOTUP`).
-    pub boot_up_message: bool,
-    /// What the device does when its crystal fails, and the clock of its CAN controller may be wrong.
-    pub crystal_failure: CrystalFailure,
-    /// Base of the COB-ID of SDO requests; the node-ID is added (`BLCOP_BASE_REQUEST`). With each of
-    /// `node_ids` it must be no reserved COB-ID (CiA 301 clause 7.3.5), and one that the predefined connection set
-    /// has for nothing else than SDO or PDOs (7.3.3): no node of the bus may then use that PDO.
-    pub sdo_request_base: u16,
-    /// Base of the COB-ID of SDO answers; the node-ID is added (`BLCOP_BASE_RESPONSE`). The same applies.
-    pub sdo_response_base: u16,
-    /// Whether the device may detect the bit rate by listening, if none is stored or set; on boards with the
-    /// split map alone.
-    pub auto_bit_rate: bool,
-    /// Whether an emergency follows each boot-up. It shows a master that the bootloader runs, and
-    /// not the application.
-    pub boot_up_emergency: bool,
-    /// Period of the heartbeat (1017h, which is constant), in ms; 0 for none.
-    pub heartbeat_ms: u16,
-    /// Whether the device supports layer setting services (LSS, CiA 305); on boards with the compact map
-    /// without a profile that has a password.
-    pub lss: bool,
-    /// Whether the device starts in LSS configuration state, for a bus with one device to
-    /// configure.
-    pub lss_start_in_configuration: bool,
-    /// Whether the device reports a missing node-ID by "non-configured slave".
-    pub lss_announce: bool,
-    /// Whether LSS masters find the device by ranges of its address (identify remote slave, 46h to 4Bh), besides
-    /// fastscan; on boards with the split map alone.
-    pub lss_identify: bool,
-    /// Whether LSS may store node-ID and bit rate.
-    pub lss_store: bool,
-    /// Whether programs can be written by SDO block download. Without it the device answers 05040001h, and
-    /// a master goes on in segments, which takes two to three times as long (`SDO_BLOCKTRANSFER`). On boards with the
-    /// compact map the dialects of Paulus and ESAcademy have none.
-    pub block_download: bool,
-    /// The segments of a sub-block of a block download at most, 1 to 127; at low bit rates the device takes
-    /// fewer (`SDO_BLOCKSIZE_DOWNLOAD`).
-    pub segments_per_sub_block: u8,
-    /// Received frames that may wait for the protocol, 8 to 255 (`CDRV_MAX_RX_BUFF_ENTRIES_LOW`).
-    pub receive_queue: u8,
-    /// Whether objects can be read by SDO block upload; on boards with the split map alone.
-    pub block_upload: bool,
-    /// Whether there is a second SDO server (1201h), by which one client writes a program to several
-    /// devices at once; on boards with the split map alone.
-    pub second_server: bool,
-    /// Whether a download of block files that was cut off can go on where it stopped (2006h); on boards
-    /// with the split map alone.
-    pub resume: bool,
-    /// Whether programs can be read where the dialect says so, and 100Ah is the version of the stored
-    /// program; on boards with the split map alone.
-    pub read_back: bool,
-    /// Whether date and time of the program can be read (1F52h), in the bootloader and in the program; on
-    /// boards with the split map alone.
-    pub program_date: bool,
-    /// Whether programs are taken as Intel HEX, too; on boards with the compact map in ESAcademy's profile
-    /// alone.
-    pub intel_hex: bool,
-    /// Where vendor-ID, product code, revision and serial number (1018h) come from
-    /// (`BLCOP_IDENTITY_VENDORID` to `BLCOP_IDENTITY_SERIALNR`).
-    pub identity: IdentitySource,
-    /// Whether vendor-ID and product code of a program must be the device's
-    /// (`BLCOP_IDENTITY_CHECK`).
-    pub identity_check: bool,
-    /// The product's own check of block 0 and of the label in the image (`TgtProcessAppInfoData`).
-    pub check: fn(program: u8, info: &AppInfo<'_>) -> Verdict,
-    /// Whether programs may be changed now.
-    pub programming_allowed: fn() -> bool,
-    /// The time of the erase for CLEAR of a program (`TgtCheckEraseApp`); `None` for the profile's.
-    pub erase: Option<fn(program: u8) -> Erase>,
-    /// Whether a signed program may be started now: for instance a function that reads a port pin
-    /// (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and must
-    /// leave the peripherals that it uses as after a reset ([`bsp::inputs`] does).
-    pub start_allowed: fn(program: u8) -> bool,
-    /// The CRC of blocks and programs (`BLCOP_USE_CRC16`); CRC-16 on boards with the split map alone.
-    pub crc: CrcKind,
-    /// Bytes of flash that one step of a CRC covers, 64 to 65536. Other work of the same priority
-    /// waits for one step at most (`BLCOP_MAX_CRC_STEP_SIZE`).
-    pub crc_step: u32,
-    /// Size of the buffer for blocks that wait for the flash, in bytes: 1024 up to the free RAM
-    /// (`BLCOP_MAX_PROGRAM_BUFFER`). While a sector of 128 KiB is erased, a bus at 1 Mbit/s
-    /// delivers some 55 KiB.
-    pub block_buffer: usize,
-    /// The longest time without a check-in of a task of the bootloader before the watchdog resets
-    /// the chip, in ms, 250 to 4000: it runs while a crystal that does not start is waited for. `None` for no
-    /// watchdog (`BLCOP_USE_WATCHDOG`).
-    pub watchdog_ms: Option<u16>,
-    /// The time within which a program must feed the independent watchdog, from its first
-    /// instruction on, in ms, 1 to 4000; `None` to start programs without the watchdog.
-    pub program_watchdog_ms: Option<u16>,
-    /// How long the device waits for its reset after the answer is on the bus, in ms, 10 to 1000:
-    /// clients expect to see the answer first. With 15 the bus is silent for less than 25 ms in a restart.
-    pub answer_to_reset_ms: u32,
-    /// The lowest accepted security counter of a sealed image, whatever is stored (feature
-    /// `sealed`).
-    pub security_counter: u32,
-    /// Whether the security counter is raised when a program is confirmed, instead of when it is
-    /// installed (feature `sealed`).
-    pub counter_with_confirmation: bool,
-    /// The bytes of the resident part that was released with the product's devices, usually by
-    /// `include_bytes!`; the RAM image is then built for it. `None` for a fresh one. The choices in
-    /// [`FACTS`] must be the same.
-    pub resident: Option<&'static [u8]>,
-    /// Whether the bootloader itself can be renewed over CAN (docs/renewal.md); on boards whose layout
-    /// has `staging` alone.
-    pub renewal: bool,
-    /// The time within which a master must confirm a new bootloader on trial, in seconds, 1 to 3600.
-    pub renewal_s: u16,
-    /// The security counter of this bootloader (feature `sealed`): a device takes a new one only with a
-    /// higher counter.
-    pub bootloader_counter: u32,
-    /// The hardware revisions on which this bootloader runs: bit n for revision numbers (1018h/3) with n in
-    /// the five lowest bits; 0 for all.
-    pub bootloader_revisions: u32,
+/// Makes the struct of the choices, its groups, and their defaults of the table in `choices.rs`.
+macro_rules! choices {
+    ($(
+        $(#[doc = $about:literal])*
+        $group:ident: $type:ty = $default:expr => [$($other:expr),*]
+        $(, $(#[$meta:meta])* struct $Group:ident {
+            $(
+                $(#[doc = $text:literal])*
+                $field:ident: $field_type:ty = $field_default:expr => [$($field_other:expr),*];
+            )*
+        })?
+    ;)*) => {
+        /// The choices of a product.
+        #[derive(Clone, Debug)]
+        pub struct Product {
+            $($(#[doc = $about])* pub $group: $type,)*
+        }
+
+        impl Product {
+            /// A product with no choice of its own.
+            pub const DEFAULT: Self = Self { $($group: $default,)* };
+        }
+
+        $($(
+            #[doc = concat!("See [`Product::", stringify!($group), "`].")]
+            #[derive(Clone, Debug)]
+            $(#[$meta])*
+            pub struct $Group {
+                $($(#[doc = $text])* pub $field: $field_type,)*
+            }
+
+            impl $Group {
+                /// The defaults of the group.
+                pub const DEFAULT: Self = Self { $($field: $field_default,)* };
+            }
+        )?)*
+    };
 }
 
-impl Product {
-    /// A product with no choice of its own.
-    pub const DEFAULT: Self = Self {
-        profile: Profile::STANDARD,
-        autostart: Autostart::InOrder,
-        max_crash_resets: 3,
-        rescue_window_ms: 300,
-        rescue_window_confirmed_ms: 0,
-        two_resets: false,
-        rom_loader: false,
-        node_ids: 1..=127,
-        bit_rates: 0..=8,
-        node_source: NodeSource::Stored,
-        boot_up_message: true,
-        crystal_failure: CrystalFailure::Silent,
-        sdo_request_base: 0x600,
-        sdo_response_base: 0x580,
-        auto_bit_rate: LAYOUT.home.is_some(),
-        boot_up_emergency: true,
-        heartbeat_ms: 1000,
-        lss: true,
-        lss_start_in_configuration: false,
-        lss_announce: false,
-        lss_identify: LAYOUT.home.is_some(),
-        lss_store: true,
-        block_download: true,
-        segments_per_sub_block: 127,
-        receive_queue: 32,
-        block_upload: LAYOUT.home.is_some(),
-        second_server: LAYOUT.home.is_some(),
-        resume: LAYOUT.home.is_some(),
-        read_back: LAYOUT.home.is_some(),
-        program_date: LAYOUT.home.is_some(),
-        intel_hex: LAYOUT.home.is_some(),
-        identity: IdentitySource::Board,
-        identity_check: true,
-        check: |_, _| Verdict::Standard,
-        programming_allowed: || true,
-        erase: None,
-        start_allowed: |_| true,
-        crc: CrcKind::Crc32,
-        crc_step: 1024,
-        block_buffer: if SEALED { 48 } else { 80 } * 1024,
-        watchdog_ms: Some(1000),
-        program_watchdog_ms: None,
-        answer_to_reset_ms: 15,
-        security_counter: 0,
-        counter_with_confirmation: false,
-        resident: None,
-        renewal: LAYOUT.staging.is_some(),
-        renewal_s: 60,
-        bootloader_counter: 0,
-        bootloader_revisions: 0,
-    };
+include!("choices.rs");
 
+impl Product {
     /// A product whose only choice is its dialect. On the compact map a dialect has what its manual has:
     /// ESAcademy's has Intel HEX, it and Paulus' have no SDO block transfer; ESAcademy's nodes and lifts have a node-ID
     /// of their own, and no LSS.
     pub const fn of(profile: Profile) -> Self {
-        let lss = LAYOUT.home.is_some() || !profile.download.locked;
+        let Self { lss, block_download, download, .. } = Self::DEFAULT;
         Self {
-            lss,
-            // A silent device waits for LSS.
-            crystal_failure: if lss { CrystalFailure::Silent } else { CrystalFailure::RunFromHsi },
-            block_download: LAYOUT.home.is_some() || has_block_transfer(&profile),
-            intel_hex: LAYOUT.home.is_some() || sends_hex(&profile),
+            lss: if SPLIT || !profile.download.locked { lss } else { None },
+            block_download: if SPLIT || has_block_transfer(&profile) { block_download } else { None },
+            download: Download { intel_hex: SPLIT || sends_hex(&profile), ..download },
             profile,
             ..Self::DEFAULT
         }
@@ -277,220 +123,277 @@ impl Product {
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
     /// message of the broken rule.
     pub const fn checked(self) -> Self {
-        if let Autostart::List(list) = self.autostart {
+        self.check_autostart();
+        self.check_map();
+        self.check_node();
+        self.check_sdo();
+        let Download { crc, crc_step, block_buffer, .. } = self.download;
+        assert!(
+            !SEALED || matches!(crc, CrcKind::Crc32),
+            "product: a sealed image carries a CRC-32: write `crc: CrcKind::Crc32`"
+        );
+        assert!(
+            !(SEALED && self.ways_in.rom_loader),
+            "product: ways_in.rom_loader would write any program into a device that takes sealed images: write \
+             `rom_loader: false`"
+        );
+        assert!(crc_step >= 64, "product: download.crc_step must be 64 bytes or more");
+        assert!(
+            crc_step <= 64 * 1024,
+            "product: download.crc_step must be 65536 bytes or less: the watchdog waits for a step"
+        );
+        assert!(
+            block_buffer >= 1024 && block_buffer < LAYOUT.ram.size as usize,
+            "product: download.block_buffer must be 1024 bytes or more, and fit the RAM"
+        );
+        if let Some(ms) = self.watchdog.bootloader_ms {
+            assert!(ms >= 250 && ms <= 4000, "product: watchdog.bootloader_ms must be 250 to 4000");
+        }
+        if let Some(ms) = self.watchdog.program_ms {
+            assert!(ms >= 1 && ms <= 4000, "product: watchdog.program_ms must be 1 to 4000");
+        }
+        let ms = self.nmt.answer_to_reset_ms;
+        assert!(
+            ms >= 10,
+            "product: nmt.answer_to_reset_ms must be 10 or more (SYS TEC manual L-1112d_10, 4.5)"
+        );
+        assert!(
+            ms <= 1000,
+            "product: nmt.answer_to_reset_ms must be 1000 or less: until its reset the device is silent"
+        );
+        if let Some(Renewal { confirm_within_s: s, .. }) = self.renewal {
+            assert!(
+                STAGING,
+                "product: renewal needs a layout with staging, where a new bootloader waits: write `renewal: None`"
+            );
+            assert!(
+                self.watchdog.bootloader_ms.is_some(),
+                "product: renewal needs watchdog.bootloader_ms, which ends the trial of a bootloader that hangs: write \
+                 `renewal: None`, or `bootloader_ms: Some(1000)`"
+            );
+            assert!(s >= 1 && s <= 3600, "product: renewal.confirm_within_s must be 1 to 3600");
+        }
+        assert!(
+            self.profile.download.locked != self.profile.password.is_empty(),
+            "product: a profile that locks 1F50h needs a password, and only such a profile has one"
+        );
+        self
+    }
+
+    const fn check_autostart(&self) {
+        let Some(start) = self.autostart else { return };
+        if let Autostart::List(list) = start.programs {
+            assert!(
+                !list.is_empty(),
+                "product: autostart.programs has no program: write `autostart: None` for a device that waits for START"
+            );
             let mut at = 0;
             while at < list.len() {
                 assert!(
                     list[at] != 0,
-                    "product: autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1"
+                    "product: autostart.programs counts from 1; BLCOP_APP_START_INDEX = 0 is program 1"
                 );
                 assert!(
                     list[at] as usize <= LAYOUT.programs.len(),
-                    "product: autostart names a program that the layout has not"
+                    "product: autostart.programs names a program that the layout has not"
                 );
                 assert!(
                     !matches!(self.profile.download.data, Some(data) if data == list[at]),
-                    "product: autostart names the profile's data, which are no program"
+                    "product: autostart.programs names the profile's data, which are no program"
                 );
                 let mut other = 0;
                 while other < at {
-                    assert!(list[other] != list[at], "product: autostart names a program twice");
+                    assert!(list[other] != list[at], "product: autostart.programs names a program twice");
                     other += 1;
                 }
                 at += 1;
             }
         }
-        assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
+        assert!(start.max_crash_resets >= 1, "product: autostart.max_crash_resets must be 1 or more");
         assert!(
-            LAYOUT.home.is_some() || matches!(self.crc, CrcKind::Crc32),
-            "product: CrcKind::Crc16 needs the split map: the compact one has no room for it"
+            start.max_crash_resets <= 255,
+            "product: autostart.max_crash_resets must be 255 or less: each crash is counted in the flash"
+        );
+        let heartbeat = self.nmt.heartbeat_ms;
+        assert!(
+            heartbeat == 0
+                || start.rescue_window_ms < heartbeat && start.rescue_window_confirmed_ms < heartbeat,
+            "product: the rescue windows of autostart must be shorter than nmt.heartbeat_ms"
+        );
+    }
+
+    /// What the compact map has no room for.
+    const fn check_map(&self) {
+        if SPLIT {
+            return;
+        }
+        let Download { resume, read_back, program_date, intel_hex, crc, .. } = self.download;
+        assert!(
+            matches!(crc, CrcKind::Crc32),
+            "product: CrcKind::Crc16 needs the split map, the compact one has no room for it: write `crc: \
+             CrcKind::Crc32`"
         );
         assert!(
-            LAYOUT.home.is_some() || !self.block_download || has_block_transfer(&self.profile),
-            "product: block_download needs the split map in the profiles PAULUS and ESACADEMY; Product::of(profile) has \
-             what fits"
+            self.block_download.is_none() || has_block_transfer(&self.profile),
+            "product: block_download needs the split map in the profiles PAULUS and ESACADEMY: write `block_download: \
+             None`, or `..Product::of(profile)`, which has what fits"
         );
         assert!(
-            self.block_download || !self.second_server,
-            "product: second_server needs block_download, by which a group gets its data"
+            !(self.sdo.block_upload
+                || resume
+                || read_back
+                || program_date
+                || self.node.auto_bit_rate
+                || matches!(self.block_download, Some(BlockDownload { second_server: true, .. }))
+                || matches!(self.lss, Some(Lss { identify: true, .. }))),
+            "product: sdo.block_upload, block_download.second_server, download.resume, download.read_back, \
+             download.program_date, node.auto_bit_rate and lss.identify need the split map, the compact one has no \
+             room for them: write `false`"
         );
         assert!(
-            LAYOUT.home.is_some()
-                || !(self.block_upload
-                    || self.second_server
-                    || self.resume
-                    || self.read_back
-                    || self.program_date
-                    || self.auto_bit_rate
-                    || self.lss_identify),
-            "product: block_upload, second_server, resume, read_back, program_date, auto_bit_rate and lss_identify \
-             need the split map: the compact one has no room for them"
+            self.lss.is_none() || !self.profile.download.locked,
+            "product: lss needs the split map in a profile with a password, the compact one has no room for both: \
+             write `lss: None`, or `..Product::of(profile)`, which has what fits"
         );
         assert!(
-            self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),
-            "product: a device without lss cannot wait for it: crystal_failure must be RunFromHsi"
+            !intel_hex || sends_hex(&self.profile),
+            "product: download.intel_hex needs the split map, or ESAcademy's profile, the compact one has no room for \
+             it: write `intel_hex: false`"
         );
-        assert!(
-            !(SEALED && self.rom_loader),
-            "product: rom_loader would write any program into a device that takes sealed images"
-        );
-        assert!(
-            self.segments_per_sub_block >= 1 && self.segments_per_sub_block <= 127,
-            "product: segments_per_sub_block must be 1 to 127"
-        );
-        assert!(self.receive_queue >= 8, "product: receive_queue must be 8 or more");
-        assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
-        assert!(
-            self.max_crash_resets <= 255,
-            "product: max_crash_resets must be 255 or less: each crash is counted in the flash"
-        );
-        let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
-            self.rescue_window_ms
-        } else {
-            self.rescue_window_confirmed_ms
-        };
-        assert!(
-            window == 0 || self.autostart.is_on(),
-            "product: a rescue window needs autostart: without it no program starts by itself"
-        );
-        assert!(
-            self.heartbeat_ms == 0 || window < self.heartbeat_ms,
-            "product: the rescue window must be shorter than the heartbeat period"
-        );
-        assert!(
-            *self.node_ids.start() >= 1
-                && *self.node_ids.end() <= 127
-                && *self.node_ids.start() <= *self.node_ids.end(),
-            "product: node_ids must be a range within 1 to 127"
-        );
-        assert!(
-            *self.bit_rates.end() <= 8 && *self.bit_rates.start() <= *self.bit_rates.end(),
-            "product: bit_rates must be a range within 0 to 8"
-        );
-        let (request, response) = (self.sdo_request_base, self.sdo_response_base);
+    }
+
+    const fn check_sdo(&self) {
+        let Sdo { request_base: request, response_base: response, receive_queue, .. } = self.sdo;
         assert!(
             request >= 0x80 && request <= 0x780 && response >= 0x80 && response <= 0x780,
-            "product: sdo_request_base and sdo_response_base must be 80h to 780h"
+            "product: sdo.request_base and sdo.response_base must be 80h to 780h"
         );
         assert!(
             request.abs_diff(response) >= 0x80,
-            "product: sdo_request_base and sdo_response_base must be 80h or more apart"
+            "product: sdo.request_base and sdo.response_base must be 80h or more apart"
         );
         assert!(
             request.abs_diff(0x700) >= 0x80 && response.abs_diff(0x700) >= 0x80,
             "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"
         );
         assert!(
-            !is_taken(request, 0x600, &self),
-            "product: sdo_request_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
+            !is_taken(request, 0x600, self),
+            "product: sdo.request_base plus one of node.ids is a COB-ID of another service (CiA 301: 000h to 180h, \
              580h to 67Fh, 6E0h to 7FFh): take 600h, or a base from 180h to 500h, or 680h up to node 95"
         );
         assert!(
-            !is_taken(response, 0x580, &self),
-            "product: sdo_response_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
+            !is_taken(response, 0x580, self),
+            "product: sdo.response_base plus one of node.ids is a COB-ID of another service (CiA 301: 000h to 180h, \
              580h to 67Fh, 6E0h to 7FFh): take 580h, or a base from 180h to 500h, or 680h up to node 95"
         );
-        self.check_board_node();
-        assert!(self.crc_step >= 64, "product: crc_step must be 64 bytes or more");
-        assert!(
-            self.crc_step <= 64 * 1024,
-            "product: crc_step must be 65536 bytes or less: the watchdog waits for a step"
-        );
-        assert!(
-            self.block_buffer >= 1024 && self.block_buffer < LAYOUT.ram.size as usize,
-            "product: block_buffer must be 1024 bytes or more, and fit the RAM"
-        );
-        if let Some(ms) = self.watchdog_ms {
-            assert!(ms >= 250 && ms <= 4000, "product: watchdog_ms must be 250 to 4000");
+        assert!(receive_queue >= 8, "product: sdo.receive_queue must be 8 or more");
+        if let Some(BlockDownload { segments_per_sub_block: segments, .. }) = self.block_download {
+            assert!(
+                segments >= 1 && segments <= 127,
+                "product: block_download.segments_per_sub_block must be 1 to 127"
+            );
         }
-        if let Some(ms) = self.program_watchdog_ms {
-            assert!(ms >= 1 && ms <= 4000, "product: program_watchdog_ms must be 1 to 4000");
-        }
-        assert!(
-            self.answer_to_reset_ms >= 10,
-            "product: answer_to_reset_ms must be 10 or more (SYS TEC manual L-1112d_10, 4.5)"
-        );
-        assert!(
-            self.answer_to_reset_ms <= 1000,
-            "product: answer_to_reset_ms must be 1000 or less: until its reset the device is silent"
-        );
-        assert!(
-            !self.renewal || LAYOUT.staging.is_some(),
-            "product: renewal needs a layout with staging, where a new bootloader waits"
-        );
-        assert!(
-            !self.renewal || self.watchdog_ms.is_some(),
-            "product: renewal needs watchdog_ms: it ends the trial of a bootloader that hangs"
-        );
-        assert!(self.renewal_s >= 1 && self.renewal_s <= 3600, "product: renewal_s must be 1 to 3600");
-        assert!(
-            self.profile.download.locked != self.profile.password.is_empty(),
-            "product: a profile that locks 1F50h needs a password, and only such a profile has one"
-        );
-        assert!(
-            LAYOUT.home.is_some() || !self.lss || !self.profile.download.locked,
-            "product: lss needs the split map in a profile with a password: the compact one has no room for \
-             both; Product::of(profile) has what fits"
-        );
-        assert!(
-            LAYOUT.home.is_some() || !self.intel_hex || sends_hex(&self.profile),
-            "product: intel_hex needs the split map, or ESAcademy's profile: the compact one has no room for it"
-        );
-        assert!(
-            self.auto_bit_rate || BIT_RATE != 0,
-            "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off"
-        );
-        self
     }
 
     /// A device without stored values has the node-ID and the bit rate of the profile or the board: they must be
     /// among those that the product takes.
-    const fn check_board_node(&self) {
+    const fn check_node(&self) {
+        let Node { ids, bit_rates, auto_bit_rate, source } = &self.node;
+        assert!(
+            *ids.start() >= 1 && *ids.end() <= 127 && *ids.start() <= *ids.end(),
+            "product: node.ids must be a range within 1 to 127"
+        );
+        assert!(
+            *bit_rates.end() <= 8 && *bit_rates.start() <= *bit_rates.end(),
+            "product: node.bit_rates must be a range within 0 to 8"
+        );
+        assert!(
+            *auto_bit_rate || BIT_RATE != 0,
+            "product: the board leaves the bit rate to be found out (0), and node.auto_bit_rate is off: write \
+             `auto_bit_rate: true`, or give the board a bit rate"
+        );
         let (node_id, bit_rate) = match self.profile.default_node {
             Some((id, bit_rate)) => (id.get(), Some(bit_rate)),
             None => (NODE_ID, BitRate::from_bits_per_second(BIT_RATE)),
         };
         let index = match bit_rate {
             // For the first one the product needs `auto_bit_rate`; the second one is the board's mistake.
-            Some(BitRate::Auto) | None => *self.bit_rates.start(),
+            Some(BitRate::Auto) | None => *bit_rates.start(),
             Some(bit_rate) => bit_rate as u8,
         };
         assert!(
-            index >= *self.bit_rates.start() && index <= *self.bit_rates.end(),
-            "product: bit_rates is without the bit rate of a new device (bit_rate of the board, or that of the \
+            index >= *bit_rates.start() && index <= *bit_rates.end(),
+            "product: node.bit_rates is without the bit rate of a new device (bit_rate of the board, or that of the \
              profile): add its index, or change the board's"
         );
-        if matches!(self.node_source, NodeSource::Function(_)) {
+        if matches!(source, NodeSource::Function(_)) {
             return;
         }
         assert!(
-            node_id == NO_NODE_ID || node_id >= *self.node_ids.start() && node_id <= *self.node_ids.end(),
-            "product: node_ids is without the node-ID of a new device (node_id of the board, or that of the \
+            node_id == NO_NODE_ID || node_id >= *ids.start() && node_id <= *ids.end(),
+            "product: node.ids is without the node-ID of a new device (node_id of the board, or that of the \
              profile): add it, or set the board's to one of them, or to 255 for none"
         );
         assert!(
-            node_id != NO_NODE_ID || self.lss || self.profile.node_id.is_some(),
-            "product: without lss a new device never gets a node-ID (node_id of the board is 255): set lss, or the \
-             board's node_id"
+            node_id != NO_NODE_ID || self.lss.is_some() || self.profile.node_id.is_some(),
+            "product: without lss a new device never gets a node-ID (node_id of the board is 255): write `lss: \
+             Some(Lss::DEFAULT)`, or set the board's node_id"
         );
+    }
+
+    /// What starts by itself.
+    const fn start(&self) -> Start {
+        match self.autostart {
+            Some(start) => start,
+            None => Start {
+                programs: Autostart::List(&[]),
+                rescue_window_ms: 0,
+                rescue_window_confirmed_ms: 0,
+                ..Start::DEFAULT
+            },
+        }
+    }
+
+    /// Layer setting services; values of no meaning if there are none.
+    pub const fn lss_or_default(&self) -> Lss {
+        match self.lss {
+            Some(lss) => lss,
+            None => Lss { crystal_failure: CrystalFailure::RunFromHsi, ..Lss::DEFAULT },
+        }
+    }
+
+    /// SDO block download; values of no meaning if there is none.
+    pub const fn block_download_or_default(&self) -> BlockDownload {
+        match self.block_download {
+            Some(block_download) => block_download,
+            None => BlockDownload::DEFAULT,
+        }
+    }
+
+    /// The renewal; the default values, with which a RAM image is for any device, if there is none.
+    pub const fn renewal_or_default(&self) -> Renewal {
+        match self.renewal {
+            Some(renewal) => renewal,
+            None => Renewal::DEFAULT,
+        }
     }
 
     /// The policy for downloads to a device of this identity: the profile's rules with the product's
     /// choices.
-    pub const fn download(&self, device: &Nameplate, renewal: &'static Renewal) -> Policy {
+    pub const fn download_policy(&self, device: &Nameplate, renewal: &'static control::Renewal) -> Policy {
         Policy {
-            identity: if self.identity_check { Some((device.vendor_id, device.product_code)) } else { None },
-            check: self.check,
-            allowed: self.programming_allowed,
-            erase: match self.erase {
+            identity: if self.identity.check { Some((device.vendor_id, device.product_code)) } else { None },
+            check: self.hooks.check,
+            allowed: self.hooks.programming_allowed,
+            erase: match self.hooks.erase {
                 Some(erase) => erase,
                 None => self.profile.download.erase,
             },
-            crc: self.crc,
-            crc_step: self.crc_step,
+            crc: self.download.crc,
+            crc_step: self.download.crc_step,
             seal: if SEALED { self.seal(device) } else { SealPolicy::NONE },
             read_back: self.reads_back(),
-            renewal: if self.renewal { Some(renewal) } else { None },
+            renewal: if self.renewal.is_some() { Some(renewal) } else { None },
             ..self.profile.download
         }
     }
@@ -499,19 +402,19 @@ impl Product {
     pub const fn extras(&self) -> Extras {
         Extras {
             sealed: SEALED,
-            second_server: self.second_server,
-            resume: self.resume,
-            program_date: self.program_date,
+            second_server: matches!(self.block_download, Some(BlockDownload { second_server: true, .. })),
+            resume: self.download.resume,
+            program_date: self.download.program_date,
             read_back: self.reads_back(),
             bootloader: self.bootloader_number(),
-            rom_loader: self.rom_loader,
+            rom_loader: self.ways_in.rom_loader,
             ..self.profile.extras
         }
     }
 
     /// The program number of the bootloader itself.
     pub const fn bootloader_number(&self) -> Option<u8> {
-        if self.renewal {
+        if self.renewal.is_some() {
             Some(renewal::number(LAYOUT.programs.len() as u8, self.profile.download.data))
         } else {
             None
@@ -519,7 +422,7 @@ impl Product {
     }
 
     const fn reads_back(&self) -> bool {
-        self.read_back && self.profile.extras.read_back
+        self.download.read_back && self.profile.extras.read_back
     }
 
     /// The values with which a device of this identity checks sealed images.
@@ -531,26 +434,27 @@ impl Product {
             data: self.profile.download.data,
             unique_id: bsp::unique_id,
             cycles: bsp::cycles,
-            counter: self.security_counter,
-            counter_with_confirmation: self.counter_with_confirmation,
+            counter: self.seal.counter,
+            counter_with_confirmation: self.seal.counter_with_confirmation,
         }
     }
 
     /// The policy for the decision after a reset.
     pub const fn decision(&self) -> decision::Policy {
+        let start = self.start();
         decision::Policy {
-            autostart: self.autostart,
+            autostart: start.programs,
             programs: &PROGRAMS,
-            max_crash_resets: self.max_crash_resets,
-            node_ids: *self.node_ids.start()..=*self.node_ids.end(),
-            rescue_window_ms: self.rescue_window_ms,
-            rescue_window_confirmed_ms: self.rescue_window_confirmed_ms,
-            start_allowed: self.start_allowed,
-            two_resets: self.two_resets,
-            renewal: self.renewal,
+            max_crash_resets: start.max_crash_resets,
+            node_ids: *self.node.ids.start()..=*self.node.ids.end(),
+            rescue_window_ms: start.rescue_window_ms,
+            rescue_window_confirmed_ms: start.rescue_window_confirmed_ms,
+            start_allowed: self.hooks.start_allowed,
+            two_resets: self.ways_in.two_resets,
+            renewal: self.renewal.is_some(),
             sealed: SEALED,
             layout: LAYOUT,
-            crc: self.crc,
+            crc: self.download.crc,
         }
     }
 }
@@ -577,8 +481,8 @@ const fn is_taken(base: u16, own: u16, product: &Product) -> bool {
         Some(id) => is_free(base, id.get()),
         None => true,
     };
-    let mut node_id = *product.node_ids.start();
-    while node_id <= *product.node_ids.end() {
+    let mut node_id = *product.node.ids.start();
+    while node_id <= *product.node.ids.end() {
         free &= is_free(base, node_id);
         node_id += 1;
     }
@@ -630,11 +534,11 @@ const HAS_DATA: bool =
 
 /// 2007h/10.
 pub const PROGRAM_START: ProgramStart = ProgramStart {
-    watchdog_ms: match PRODUCT.program_watchdog_ms {
+    watchdog_ms: match PRODUCT.watchdog.program_ms {
         Some(ms) => ms,
         None => 0,
     },
-    by_itself: match PRODUCT.autostart {
+    by_itself: match PRODUCT.start().programs {
         Autostart::InOrder => first_two(&PROGRAMS),
         Autostart::List(list) => first_two(list),
         Autostart::Function(_) => [ProgramStart::DECIDED, 0],
@@ -663,13 +567,13 @@ impl decision::Product for Chosen {
 }
 
 /// The values for a renewal of the bootloader in a device of this identity.
-pub const fn renewal(device: &Nameplate) -> Renewal {
-    Renewal {
+pub const fn renewal(device: &Nameplate) -> control::Renewal {
+    control::Renewal {
         board: BOARD_IDENTITY,
         features: ABILITIES,
         identity: Some((device.vendor_id, device.product_code)),
         revision: device.revision,
-        confirm_within_s: PRODUCT.renewal_s,
+        confirm_within_s: PRODUCT.renewal_or_default().confirm_within_s,
     }
 }
 
@@ -677,11 +581,11 @@ pub const fn renewal(device: &Nameplate) -> Renewal {
 pub const BOARD: Nameplate = Nameplate::new(IDENTITY.vendor_id, IDENTITY.product_code, IDENTITY.revision, 0);
 
 /// Whether a device may have an identity that is not the board's.
-pub const HAS_NAMEPLATE: bool = matches!(PRODUCT.identity, IdentitySource::Otp);
+pub const HAS_NAMEPLATE: bool = matches!(PRODUCT.identity.source, IdentitySource::Otp);
 
 /// The nameplate of this device, if the product has one.
 pub fn nameplate() -> Option<Nameplate> {
-    match PRODUCT.identity {
+    match PRODUCT.identity.source {
         IdentitySource::Board => None,
         IdentitySource::Otp => bsp::nameplate(),
     }
@@ -700,16 +604,16 @@ pub const FACTS: Facts = Facts {
     board: BOARD_IDENTITY,
     size: Facts::SIZE,
     autostart: u16::from_le_bytes(PROGRAM_START.by_itself),
-    crc_bits: match PRODUCT.crc {
+    crc_bits: match PRODUCT.download.crc {
         CrcKind::Crc32 => 32,
         CrcKind::Crc16 => 16,
     },
-    node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
-    bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
-        | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
+    node_ids: *PRODUCT.node.ids.start() as u16 | (*PRODUCT.node.ids.end() as u16) << 8,
+    bit_rates: ((2 << *PRODUCT.node.bit_rates.end()) - (1 << *PRODUCT.node.bit_rates.start()))
+        | ((PRODUCT.node.auto_bit_rate as u16) << BitRate::Auto as u8),
     abilities: ABILITIES.0 as u16,
-    sdo_request_base: PRODUCT.sdo_request_base,
-    sdo_response_base: PRODUCT.sdo_response_base,
+    sdo_request_base: PRODUCT.sdo.request_base,
+    sdo_response_base: PRODUCT.sdo.response_base,
 };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
@@ -752,7 +656,7 @@ pub fn node_parameters<F: Flash>(
     let default =
         PRODUCT.profile.default_node.map(|(id, bit_rate)| NodeParameters { id: Some(id), bit_rate });
     let default = default.unwrap_or(BOARD_NODE);
-    match PRODUCT.node_source {
+    match PRODUCT.node.source {
         NodeSource::Stored => NodeParameters::load(parameters, flash, default, supports),
         NodeSource::Constant => default,
         NodeSource::Function(read) => {
@@ -766,11 +670,11 @@ pub fn node_parameters<F: Flash>(
 /// Whether the product allows this bit rate and the board's CAN controller can run at it.
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
-        BitRate::Auto => PRODUCT.auto_bit_rate,
+        BitRate::Auto => PRODUCT.node.auto_bit_rate,
         rate => {
             let index = rate as u8;
-            index >= *PRODUCT.bit_rates.start()
-                && index <= *PRODUCT.bit_rates.end()
+            index >= *PRODUCT.node.bit_rates.start()
+                && index <= *PRODUCT.node.bit_rates.end()
                 && TIMINGS[index as usize] != 0
         }
     }

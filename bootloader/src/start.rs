@@ -32,17 +32,17 @@ const _: () = {
     let is_sealed = matches!(services::word(BYTES, MARK_OFFSET), Some(KNOWS_SEALED_IMAGES));
     assert!(is_sealed == SEALED, "product: `resident` differs in the feature `sealed`");
     assert!(facts.autostart == FACTS.autostart, "product: `resident` has another autostart");
-    assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
-    assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
-    assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other bit_rates");
+    assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another download.crc");
+    assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node.ids");
+    assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other node.bit_rates");
     assert!(
         facts.sdo_request_base == FACTS.sdo_request_base
             && facts.sdo_response_base == FACTS.sdo_response_base,
-        "product: `resident` has another sdo_request_base or sdo_response_base"
+        "product: `resident` has another sdo.request_base or sdo.response_base"
     );
     let differs = Abilities(facts.abilities as u32 ^ ABILITIES.0);
-    assert!(!differs.has(Abilities::ROM_LOADER), "product: `resident` has another rom_loader");
-    assert!(!differs.has(Abilities::NAMEPLATE), "product: `resident` has another identity");
+    assert!(!differs.has(Abilities::ROM_LOADER), "product: `resident` has another ways_in.rom_loader");
+    assert!(!differs.has(Abilities::NAMEPLATE), "product: `resident` has another identity.source");
     assert!(!differs.has(Abilities::RENEWAL), "product: `resident` has another renewal");
 };
 
@@ -91,9 +91,9 @@ global_asm!(
     board = const BOARD_IDENTITY,
     vendor = const FOR.0,
     product = const FOR.1,
-    revisions = const PRODUCT.bootloader_revisions,
+    revisions = const PRODUCT.renewal_or_default().revisions,
     version = const product::VERSION,
-    counter = const PRODUCT.bootloader_counter,
+    counter = const PRODUCT.renewal_or_default().counter,
     facts = const crc32(Facts::record(BYTES, LAYOUT.bootloader.base, TABLE).unwrap()),
 );
 

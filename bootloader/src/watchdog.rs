@@ -33,7 +33,7 @@ pub struct Watchdog(pac::IWDG);
 impl Watchdog {
     /// Takes the watchdog, and starts it if the product has one.
     pub fn new(registers: pac::IWDG) -> Self {
-        if let Some(ms) = PRODUCT.watchdog_ms {
+        if let Some(ms) = PRODUCT.watchdog.bootloader_ms {
             watchdog::start(&registers, ms);
         }
         Self(registers)

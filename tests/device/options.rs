@@ -171,23 +171,3 @@ fn a_pin_says_whether_a_program_is_valid() {
     let at = (program.base - firmware::board().chip.flash.base) as usize;
     assert!(bench.machine().flash()[at..at + 4096].iter().all(|byte| *byte == 0xFF));
 }
-
-/// The page of the choices describes every field of the struct, and no other.
-#[test]
-fn the_page_has_every_choice() {
-    let source = include_str!("../../bootloader/src/product.rs");
-    let page = include_str!("../../docs/product.md");
-    let (_, fields) = source.split_once("pub struct Product {").unwrap();
-    let (fields, _) = fields.split_once("\n}").unwrap();
-    let mut fields: Vec<&str> = fields
-        .lines()
-        .filter_map(|line| line.trim().strip_prefix("pub ")?.split_once(':').map(|(name, _)| name))
-        .collect();
-    let mut rows: Vec<&str> = page
-        .lines()
-        .filter_map(|line| line.strip_prefix("| `")?.split_once('`').map(|(name, _)| name))
-        .collect();
-    fields.sort_unstable();
-    rows.sort_unstable();
-    assert_eq!(rows, fields);
-}

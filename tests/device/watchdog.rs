@@ -165,7 +165,7 @@ fn a_watchdog_of_the_option_bytes_is_slow_in_the_boot_stage_alone() {
     bench.assert_nothing_unmodelled();
 }
 
-/// A product that starts programs with a watchdog of 1000 ms (`program_watchdog_ms`): it bites after a second
+/// A product that starts programs with a watchdog of 1000 ms (`watchdog.program_ms`): it bites after a second
 /// of the LSI's nominal 32 kHz, also beside the option byte, and the registers are those that were asked for.
 #[test]
 fn a_program_that_never_feeds_its_watchdog_is_ended_after_a_second_of_the_lsi() {
@@ -190,7 +190,7 @@ fn a_program_that_never_feeds_its_watchdog_is_ended_after_a_second_of_the_lsi() 
         // The boot stage takes some milliseconds of it.
         let ms = (bitten - started).0 / 1_000_000_000;
         let nominal = 1000 * 32_000 / u64::from(lsi_hz);
-        println!("program_watchdog_ms 1000, LSI {lsi_hz} Hz: reset {ms} ms after START");
+        println!("watchdog.program_ms 1000, LSI {lsi_hz} Hz: reset {ms} ms after START");
         assert!(
             (nominal..=nominal + nominal / 100 + 5).contains(&ms),
             "{lsi_hz} Hz, {has_watchdog}: {ms} ms"

@@ -195,22 +195,24 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
     assert!(built.status.success(), "{}", text(&built));
     assert!(resident("later") == released);
     for (choices, says) in [
-        ("resident: Some(&[0; 64])".to_owned(), "product: `resident` is no resident part"),
-        (format!("{include}, crc: CrcKind::Crc16"), "product: `resident` has another crc"),
-        (format!("{include}, bit_rates: 0..=7"), "product: `resident` has other bit_rates"),
-        (format!("{include}, node_ids: 1..=126"), "product: `resident` has other node_ids"),
+        ("resident: Some(&[0; 64])", "is no resident part"),
+        ("download: Download { crc: CrcKind::Crc16, ..Download::DEFAULT }", "has another download.crc"),
+        ("node: Node { bit_rates: 0..=7, ..Node::DEFAULT }", "has other node.bit_rates"),
+        ("node: Node { ids: 1..=126, ..Node::DEFAULT }", "has other node.ids"),
+        ("autostart: None", "has another autostart"),
+        ("sdo: Sdo { request_base: 0x300, ..Sdo::DEFAULT }", "has another sdo.request_base"),
+        ("ways_in: WaysIn { rom_loader: true, ..WaysIn::DEFAULT }", "has another ways_in.rom_loader"),
         (
-            format!("{include}, autostart: Autostart::List(&[]), rescue_window_ms: 0"),
-            "product: `resident` has another autostart",
+            "identity: Identity { source: IdentitySource::Otp, ..Identity::DEFAULT }",
+            "has another identity.source",
         ),
-        (format!("{include}, sdo_request_base: 0x300"), "product: `resident` has another sdo_request_base"),
-        (format!("{include}, rom_loader: true"), "product: `resident` has another rom_loader"),
-        (format!("{include}, identity: IdentitySource::Otp"), "product: `resident` has another identity"),
     ] {
-        let refused = product(&choices);
-        assert!(!refused.status.success() && text(&refused).contains(says), "{says}: {}", text(&refused));
+        let released = if choices.starts_with("resident") { String::new() } else { format!("{include}, ") };
+        let refused = product(&format!("{released}{choices}"));
+        let says = format!("product: `resident` {says}");
+        assert!(!refused.status.success() && text(&refused).contains(&says), "{says}: {}", text(&refused));
     }
-    let built = product("heartbeat_ms: 2000");
+    let built = product("nmt: Nmt { heartbeat_ms: 2000, ..Nmt::DEFAULT }");
     assert!(built.status.success(), "{}", text(&built));
     assert!(resident("later") != released, "a fresh one has changed");
 }
@@ -220,11 +222,11 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
 fn a_sealed_product_with_the_rom_loader_is_not_built() {
     let copy = Copy::new();
     let text_of =
-        "use super::*;\n\npub const PRODUCT: Product = Product { rom_loader: true, ..Product::DEFAULT };\n";
+        "use super::*;\n\npub const PRODUCT: Product =\n    Product { ways_in: WaysIn { rom_loader: true, ..WaysIn::DEFAULT }, ..Product::DEFAULT };\n";
     fs::write(copy.root.join("bootloader/products/open.rs"), text_of).expect("it can be written");
     let refused =
         copy.cargo(&["run", "-q", "-p", "xtask", "--", "build", "bootloader-sealed", "--product", "open"]);
-    let says = "product: rom_loader would write any program into a device that takes sealed images";
+    let says = "product: ways_in.rom_loader would write any program into a device that takes sealed images";
     assert!(!refused.status.success() && text(&refused).contains(says), "{}", text(&refused));
 }
 
@@ -342,9 +344,10 @@ const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
 /// A mistake in the choices of a product.
 fn product(&(choices, says): &(&str, &'static str)) -> Mistake {
-    let rest = if choices.contains("..Product::") { "" } else { ", ..Product::DEFAULT" };
-    let wrong = format!("Product {{ {choices}{rest} }}").leak();
-    ("bootloader/products/default.rs", "Product { ..Product::DEFAULT }", wrong, By::Product(None), says)
+    let rest = if choices.contains("..Product::of") { "" } else { ", ..Product::DEFAULT" };
+    // The one of the file becomes another constant.
+    let wrong = format!("= Product {{ {choices}{rest} }};\npub const _OF_FILE: Product = Product {{").leak();
+    ("bootloader/products/default.rs", "= Product {", wrong, By::Product(None), says)
 }
 
 #[rustfmt::skip]
@@ -396,57 +399,60 @@ const MISTAKES: &[Mistake] = &[
     (BOARD, "uart_bit_rate: 115_200", "uart_bit_rate: 3_000_000", By::Drivers, "board: the clock of the UART cannot make uart_bit_rate"),
     (BOARD, " node_id: 1", " node_id: 255", By::Product(Some("least")), "product: without lss a new device never gets a node-ID"),
     // The product does not detect the bit rate.
-    (BOARD, " bit_rate: 125_000", " bit_rate: 0", By::Product(Some("least")), "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off"),
+    (BOARD, " bit_rate: 125_000", " bit_rate: 0", By::Product(Some("least")), "product: the board leaves the bit rate to be found out (0), and node.auto_bit_rate is off"),
     ("bsp/Cargo.toml", "stm32f4xx-hal/stm32f446", "stm32f4xx-hal/stm32f407", By::Drivers, "board: the PAC has 082 interrupt lines, the chip 097"),
 ];
 
 /// Choices of a product that contradict each other, the standards or the layout, which has only one program; and
 /// what the build says of it.
 const PRODUCTS: &[(&str, &str)] = &[
-    ("autostart: Autostart::List(&[2])", "autostart names a program that the layout has not"),
-    ("second_server: true, block_download: false", "second_server needs block_download, by which a group gets its data"),
-    ("auto_bit_rate: true", "program_date, auto_bit_rate and lss_identify need the split map"),
-    ("lss_identify: true", "program_date, auto_bit_rate and lss_identify need the split map"),
-    ("lss: true, ..Product::of(Profile::LIFT)", "lss needs the split map in a profile with a password"),
-    ("crc: CrcKind::Crc16", "CrcKind::Crc16 needs the split map"),
-    ("block_download: true, ..Product::of(Profile::PAULUS)", "block_download needs the split map in the profiles PAULUS"),
-    ("intel_hex: true", "intel_hex needs the split map, or ESAcademy's profile"),
-    ("segments_per_sub_block: 128", "segments_per_sub_block must be 1 to 127"),
-    ("receive_queue: 7", "receive_queue must be 8 or more"),
-    ("max_crash_resets: 0", "max_crash_resets must be 1 or more"),
-    ("autostart: Autostart::List(&[0])", "autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1"),
-    ("autostart: Autostart::List(&[1, 1])", "autostart names a program twice"),
-    ("autostart: Autostart::List(&[])", "a rescue window needs autostart: without it no program starts by itself"),
-    ("rescue_window_confirmed_ms: 1000", "the rescue window must be shorter than the heartbeat period"),
-    ("node_ids: 1..=128", "node_ids must be a range within 1 to 127"),
-    ("crc_step: 63", "crc_step must be 64 bytes or more"),
-    ("block_buffer: 1023", "block_buffer must be 1024 bytes or more, and fit the RAM"),
-    ("watchdog_ms: Some(4001)", "watchdog_ms must be 250 to 4000"),
-    ("bit_rates: 3..=9", "bit_rates must be a range within 0 to 8"),
-    ("sdo_request_base: 0x781", "sdo_request_base and sdo_response_base must be 80h to 780h"),
-    ("sdo_request_base: 0x5FF", "sdo_request_base and sdo_response_base must be 80h or more apart"),
-    ("sdo_request_base: 0x300, sdo_response_base: 0x701", "the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"),
+    ("autostart: Some(Start { programs: Autostart::List(&[2]), ..Start::DEFAULT })", "autostart.programs names a program that the layout has not"),
+    ("autostart: Some(Start { programs: Autostart::List(&[]), ..Start::DEFAULT })", "autostart.programs has no program: write `autostart: None`"),
+    ("block_download: Some(BlockDownload { second_server: true, ..BlockDownload::DEFAULT })", "node.auto_bit_rate and lss.identify need the split map, the compact one has no room for them: write `false`"),
+    ("node: Node { auto_bit_rate: true, ..Node::DEFAULT }", "node.auto_bit_rate and lss.identify need the split map, the compact one has no room for them: write `false`"),
+    ("lss: Some(Lss { identify: true, ..Lss::DEFAULT })", "node.auto_bit_rate and lss.identify need the split map, the compact one has no room for them: write `false`"),
+    ("lss: Some(Lss::DEFAULT), ..Product::of(Profile::LIFT)", "lss needs the split map in a profile with a password, the compact one has no room for both: write `lss: None`"),
+    ("download: Download { crc: CrcKind::Crc16, ..Download::DEFAULT }", "CrcKind::Crc16 needs the split map"),
+    ("block_download: Some(BlockDownload::DEFAULT), ..Product::of(Profile::PAULUS)", "block_download needs the split map in the profiles PAULUS and ESACADEMY: write `block_download: None`"),
+    ("download: Download { intel_hex: true, ..Download::DEFAULT }", "download.intel_hex needs the split map, or ESAcademy's profile"),
+    ("renewal: Some(Renewal::DEFAULT)", "renewal needs a layout with staging, where a new bootloader waits: write `renewal: None`"),
+    ("block_download: Some(BlockDownload { segments_per_sub_block: 128, ..BlockDownload::DEFAULT })", "block_download.segments_per_sub_block must be 1 to 127"),
+    ("sdo: Sdo { receive_queue: 7, ..Sdo::DEFAULT }", "sdo.receive_queue must be 8 or more"),
+    ("autostart: Some(Start { max_crash_resets: 0, ..Start::DEFAULT })", "autostart.max_crash_resets must be 1 or more"),
+    ("autostart: Some(Start { programs: Autostart::List(&[0]), ..Start::DEFAULT })", "autostart.programs counts from 1; BLCOP_APP_START_INDEX = 0 is program 1"),
+    ("autostart: Some(Start { programs: Autostart::List(&[1, 1]), ..Start::DEFAULT })", "autostart.programs names a program twice"),
+    ("autostart: Some(Start { rescue_window_confirmed_ms: 1000, ..Start::DEFAULT })", "the rescue windows of autostart must be shorter than nmt.heartbeat_ms"),
+    ("node: Node { ids: 1..=128, ..Node::DEFAULT }", "node.ids must be a range within 1 to 127"),
+    ("download: Download { crc_step: 63, ..Download::DEFAULT }", "download.crc_step must be 64 bytes or more"),
+    ("download: Download { block_buffer: 1023, ..Download::DEFAULT }", "download.block_buffer must be 1024 bytes or more, and fit the RAM"),
+    ("watchdog: Watchdog { bootloader_ms: Some(4001), ..Watchdog::DEFAULT }", "watchdog.bootloader_ms must be 250 to 4000"),
+    ("node: Node { bit_rates: 3..=9, ..Node::DEFAULT }", "node.bit_rates must be a range within 0 to 8"),
+    ("sdo: Sdo { request_base: 0x781, ..Sdo::DEFAULT }", "sdo.request_base and sdo.response_base must be 80h to 780h"),
+    ("sdo: Sdo { request_base: 0x5FF, ..Sdo::DEFAULT }", "sdo.request_base and sdo.response_base must be 80h or more apart"),
+    ("sdo: Sdo { request_base: 0x300, response_base: 0x701, ..Sdo::DEFAULT }", "the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"),
     // CiA 301 table 39 (predefined connection set): EMCY has 081h to 0FFh, SDO of other nodes 581h to 67Fh; CiA
     // 305: LSS has 7E4h and 7E5h. The board has node-ID 1 and 125 kbit/s.
-    ("sdo_response_base: 0x80", "sdo_response_base plus one of node_ids is a COB-ID of another service"),
-    ("sdo_request_base: 0x780", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
-    ("sdo_request_base: 0x501, sdo_response_base: 0x300", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    ("sdo: Sdo { response_base: 0x80, ..Sdo::DEFAULT }", "sdo.response_base plus one of node.ids is a COB-ID of another service"),
+    ("sdo: Sdo { request_base: 0x780, ..Sdo::DEFAULT }", "sdo.request_base plus one of node.ids is a COB-ID of another service"),
+    ("sdo: Sdo { request_base: 0x501, response_base: 0x300, ..Sdo::DEFAULT }", "sdo.request_base plus one of node.ids is a COB-ID of another service"),
     // CiA 301 table 40 (restricted CAN-IDs): 6E0h to 6FFh. Up to node 95 base 680h is free.
-    ("sdo_request_base: 0x680, node_ids: 1..=96", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
-    ("sdo_request_base: 0x680, node_ids: 1..=95, crc_step: 63", "crc_step must be 64 bytes or more"),
+    ("sdo: Sdo { request_base: 0x680, ..Sdo::DEFAULT }, node: Node { ids: 1..=96, ..Node::DEFAULT }", "sdo.request_base plus one of node.ids is a COB-ID of another service"),
+    ("sdo: Sdo { request_base: 0x680, ..Sdo::DEFAULT }, node: Node { ids: 1..=95, ..Node::DEFAULT }, download: Download { crc_step: 63, ..Download::DEFAULT }", "download.crc_step must be 64 bytes or more"),
     // The bootloader of a lift is node 126.
-    ("profile: Profile::LIFT, node_ids: 1..=10, sdo_request_base: 0x510, sdo_response_base: 0x480", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
-    ("node_ids: 10..=20", "node_ids is without the node-ID of a new device"),
-    ("bit_rates: 0..=2", "bit_rates is without the bit rate of a new device"),
+    ("node: Node { ids: 1..=10, ..Node::DEFAULT }, sdo: Sdo { request_base: 0x510, response_base: 0x480, ..Sdo::DEFAULT }, ..Product::of(Profile::LIFT)", "sdo.request_base plus one of node.ids is a COB-ID of another service"),
+    ("node: Node { ids: 10..=20, ..Node::DEFAULT }", "node.ids is without the node-ID of a new device"),
+    ("node: Node { bit_rates: 0..=2, ..Node::DEFAULT }", "node.bit_rates is without the bit rate of a new device"),
     // Its new devices have node-ID 64 at 125 kbit/s.
-    ("profile: Profile::ESACADEMY, block_download: false, node_ids: 1..=63", "node_ids is without the node-ID of a new device"),
-    ("max_crash_resets: 256", "max_crash_resets must be 255 or less"),
-    ("crc_step: 65537", "crc_step must be 65536 bytes or less"),
-    ("answer_to_reset_ms: 1001", "answer_to_reset_ms must be 1000 or less"),
-    ("program_watchdog_ms: Some(0)", "program_watchdog_ms must be 1 to 4000"),
-    ("answer_to_reset_ms: 9", "answer_to_reset_ms must be 10 or more"),
-    ("profile: Profile { download: Policy { data: Some(1), ..Policy::DEFAULT }, ..Profile::STANDARD }, autostart: Autostart::List(&[1])", "autostart names the profile's data, which are no program"),
-    ("profile: Profile { password: b\"\", ..Profile::LIFT }", "a profile that locks 1F50h needs a password, and only such a profile has one"),
+    ("node: Node { ids: 1..=63, ..Node::DEFAULT }, ..Product::of(Profile::ESACADEMY)", "node.ids is without the node-ID of a new device"),
+    ("autostart: Some(Start { max_crash_resets: 256, ..Start::DEFAULT })", "autostart.max_crash_resets must be 255 or less"),
+    ("download: Download { crc_step: 65537, ..Download::DEFAULT }", "download.crc_step must be 65536 bytes or less"),
+    ("nmt: Nmt { answer_to_reset_ms: 1001, ..Nmt::DEFAULT }", "nmt.answer_to_reset_ms must be 1000 or less"),
+    ("watchdog: Watchdog { program_ms: Some(0), ..Watchdog::DEFAULT }", "watchdog.program_ms must be 1 to 4000"),
+    ("nmt: Nmt { answer_to_reset_ms: 9, ..Nmt::DEFAULT }", "nmt.answer_to_reset_ms must be 10 or more"),
+    ("profile: Profile { download: Policy { data: Some(1), ..Policy::DEFAULT }, ..Profile::STANDARD }, autostart: Some(Start { programs: Autostart::List(&[1]), ..Start::DEFAULT })", "autostart.programs names the profile's data, which are no program"),
+    ("profile: Profile { password: b\"\", ..Profile::LIFT }, lss: None", "a profile that locks 1F50h needs a password, and only such a profile has one"),
+    // Choices as they were written before there were groups.
+    ("lss_store: false", "has no field named `lss_store`"),
 ];
 
 /// The lines of the guide for a chip whose flash has two banks, and for CAN2: they compile as printed.

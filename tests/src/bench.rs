@@ -19,7 +19,7 @@ use emulator::world::{MachineId, PortId, World};
 
 use crate::firmware;
 
-/// How long a program that was never confirmed is delayed (`rescue_window_ms` of the product), in ms.
+/// How long a program that was never confirmed is delayed (`autostart.rescue_window_ms` of the product), in ms.
 pub const RESCUE_WINDOW_MS: u64 = 300;
 
 /// Presses the entry strap of a board, or releases it: a resistor then pulls it the other way, that of

@@ -15,7 +15,7 @@ use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, Numbers, IDENTITY, PROGRAM_REGION};
 use canopen::BitRate;
 
-use product::{NodeSource, Product};
+use product::{Node, NodeSource, Product};
 
 use crate::products;
 
@@ -77,7 +77,8 @@ pub fn images() -> Vec<Image> {
 #[must_use]
 pub fn chosen() -> Option<Vec<Image>> {
     let product = product::PRODUCT;
-    let may_seal = bsp::LAYOUT.home.is_some() && product.crc == CrcKind::Crc32 && !product.rom_loader;
+    let may_seal =
+        bsp::LAYOUT.home.is_some() && product.download.crc == CrcKind::Crc32 && !product.ways_in.rom_loader;
     let kinds = if may_seal { &[false, true][..] } else { &[false] };
     (product::NAME != DEFAULT)
         .then(|| kinds.iter().map(|sealed| bootloader(product::NAME, &product, *sealed)).collect())
@@ -114,13 +115,13 @@ fn bootloader(name: &str, product: &Product, sealed: bool) -> Image {
         write!(software_version, " {name}").expect("a string takes everything");
     }
     let extras = Extras { sealed, ..product.extras() };
-    let is_fixed =
-        !product.lss && !product.auto_bit_rate && !matches!(product.node_source, NodeSource::Function(_));
+    let Node { source, bit_rates, auto_bit_rate, .. } = &product.node;
+    let is_fixed = product.lss.is_none() && !auto_bit_rate && !matches!(source, NodeSource::Function(_));
     let own =
         product.profile.default_node.map_or(bsp::BIT_RATE, |(_, rate)| rate.bits_per_second().unwrap_or(0));
     let has = |kbit: &u32| {
         let rate = BitRate::from_bits_per_second(kbit * 1000);
-        let is_allowed = rate.is_some_and(|rate| product.bit_rates.contains(&(rate as u8)));
+        let is_allowed = rate.is_some_and(|rate| bit_rates.contains(&(rate as u8)));
         is_allowed && can_run_at(kbit * 1000) && (!is_fixed || kbit * 1000 == own)
     };
     Image {
@@ -130,10 +131,10 @@ fn bootloader(name: &str, product: &Product, sealed: bool) -> Image {
         device: Device {
             device_type: product.profile.device_type,
             software_version: software_version.leak(),
-            heartbeat_ms: product.heartbeat_ms,
+            heartbeat_ms: product.nmt.heartbeat_ms,
             ..BOARD
         },
-        lss: product.lss,
+        lss: product.lss.is_some(),
         bit_rates: BIT_RATES.into_iter().filter(has).collect(),
     }
 }

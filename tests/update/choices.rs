@@ -26,37 +26,40 @@ use kit::model::ModelFlash;
 use product::*;
 use shared_abi::label::{Label, OFFSET, SIZE};
 
-/// Each value but the default ones, with what else it needs. (A test of `pairs` compares them with its table.)
-macro_rules! rows {
-    ($({ $($choices:tt)* })*) => {
-        [$((stringify!($($choices)*), Product { $($choices)*, ..Product::DEFAULT })),*]
+/// Makes a function of the table of all choices: the default product, and one for each other value of each choice.
+macro_rules! choices {
+    ($(
+        $(#[doc = $about:literal])*
+        $group:ident: $type:ty = $default:expr => [$($other:expr),*]
+        $(, $(#[$meta:meta])* struct $Group:ident {
+            $(
+                $(#[doc = $text:literal])*
+                $field:ident: $field_type:ty = $field_default:expr => [$($field_other:expr),*];
+            )*
+        })?
+    ;)*) => {
+        fn rows() -> Vec<(String, Product)> {
+            let mut rows = vec![("the default".to_owned(), Product::DEFAULT)];
+            let mut add = |what: &[&str], product| rows.push((what.join(" "), product));
+            $(
+                $(add(
+                    &[stringify!($group), stringify!($other)],
+                    Product { $group: $other, ..Product::DEFAULT },
+                );)*
+                $($($(add(
+                    &[stringify!($group), stringify!($field), stringify!($field_other)],
+                    Product {
+                        $group: $Group { $field: $field_other, ..$Group::DEFAULT }.into(),
+                        ..Product::DEFAULT
+                    },
+                );)*)*)?
+            )*
+            rows
+        }
     };
 }
 
-#[rustfmt::skip]
-fn rows() -> Vec<(&'static str, Product)> {
-    rows! {
-        { heartbeat_ms: 1000 } // the default
-        { profile: Profile::PAULUS } { profile: Profile::ESACADEMY } { profile: Profile::LIFT }
-        { autostart: Autostart::List(&[]), rescue_window_ms: 0 } { autostart: Autostart::Function(|| &[1]) }
-        { rescue_window_confirmed_ms: 100 } { node_ids: 1..=100 } { bit_rates: 2..=6 }
-        { node_source: NodeSource::Constant } { boot_up_message: false }
-        { crystal_failure: CrystalFailure::RunFromHsi, lss: false }
-        { sdo_request_base: 0x300 } { sdo_response_base: 0x480 } { auto_bit_rate: false }
-        { boot_up_emergency: false } { heartbeat_ms: 0 } { lss_start_in_configuration: true }
-        { lss_announce: true } { lss_identify: false } { lss_store: false } { block_download: false, second_server: false }
-        { segments_per_sub_block: 1 } { receive_queue: 8 } { block_upload: false }
-        { block_download: false, second_server: false, block_upload: false }
-        { identity_check: false } { check: |_, _| Verdict::Accept } { erase: Some(|_| Erase::AtOnce) }
-        { crc: if LAYOUT.home.is_some() { CrcKind::Crc16 } else { CrcKind::Crc32 } } { crc_step: 64 * 1024 } { block_buffer: 1024 } { watchdog_ms: None, renewal: false }
-        { program_watchdog_ms: Some(1000) } { answer_to_reset_ms: 50 } { max_crash_resets: 1 }
-        { security_counter: 5 } { counter_with_confirmation: true } { resume: false } { read_back: false }
-        { program_date: false } { intel_hex: false } { renewal_s: 1 } { bootloader_counter: 3 }
-        { bootloader_revisions: 1 } { two_resets: LAYOUT.home.is_some() } { rom_loader: LAYOUT.home.is_some() }
-        { identity: if LAYOUT.home.is_some() { IdentitySource::Otp } else { IdentitySource::Board } }
-    }
-    .into()
-}
+include!("../../bootloader/src/choices.rs");
 
 /// What the code of a bootloader has; for its other choices, its dictionary and its values decide.
 struct Blocks<const DOWNLOAD: bool, const UPLOAD: bool>;
@@ -111,25 +114,25 @@ impl<C: Choices> Bus<C> {
             node_id: product.profile.node_id,
             layout: LAYOUT,
             supports: |_| true,
-            boot_up_emergency: product.boot_up_emergency,
-            download: product.download(&BOARD, Box::leak(Box::new(renewal(&BOARD)))),
+            boot_up_emergency: product.nmt.boot_up_emergency,
+            download: product.download_policy(&BOARD, Box::leak(Box::new(renewal(&BOARD)))),
             password: product.profile.password,
         };
         let flash = Box::leak(Box::new(ModelFlash::new(LAYOUT.chip)));
         let journal = Journal::open(flash, LAYOUT.parameters);
-        let (buffer, sealed) = leaked(product.block_buffer);
+        let (buffer, sealed) = leaked(product.download.block_buffer);
         let device = Boot::new(Box::leak(Box::new(config)), kit::bench::node());
         let device = device.with(journal, flash, buffer, sealed);
         let sdo = SdoConfig {
             unknown_request: product.profile.unknown_request,
-            request_base: product.sdo_request_base,
-            response_base: product.sdo_response_base,
-            blksize: product.segments_per_sub_block,
+            request_base: product.sdo.request_base,
+            response_base: product.sdo.response_base,
+            blksize: product.block_download_or_default().segments_per_sub_block,
             ..SdoConfig::DEFAULT
         };
         let node = node::Config {
-            boot_up: product.boot_up_message,
-            heartbeat_ms: product.heartbeat_ms,
+            boot_up: product.nmt.boot_up_message,
+            heartbeat_ms: product.nmt.heartbeat_ms,
             sdo,
             ..node::Config::default()
         };
@@ -147,7 +150,7 @@ impl<C: Choices> Bus<C> {
             announced: None,
             is_in_blocks: false,
             refused: 0,
-            blksize: product.segments_per_sub_block.into(),
+            blksize: product.block_download_or_default().segments_per_sub_block.into(),
         }
     }
 
@@ -238,14 +241,14 @@ fn run<C: Choices>(choices: &str, product: &Product) -> Duration {
     let timing = Timing::default();
     let mut bus = Bus::<C>::new(product);
     let id = bus.device.node_id().expect("it has one");
-    let mut adapter = SdoIds::new(&mut bus, product.sdo_request_base, product.sdo_response_base);
+    let mut adapter = SdoIds::new(&mut bus, product.sdo.request_base, product.sdo.response_base);
     let mut session = Session::new(&mut adapter, id, timing);
     for index in [0x1000, 0x1008, 0x1008] {
         session.upload(Address::new(index, 0), &mut |_| {}).expect("it can be read");
     }
     // 1000h is expedited. 1008h by blocks: initiate, start, acknowledgement and end; two answers and four
     // segments. In segments: an initiate and four requests, as many answers; and the refused initiate, once.
-    assert_eq!(bus.all, if product.block_upload { [1 + 2 * 4, 1 + 2 * 6] } else { [1 + 1 + 2 * 5; 2] });
+    assert_eq!(bus.all, if product.sdo.block_upload { [1 + 2 * 4, 1 + 2 * 6] } else { [1 + 1 + 2 * 5; 2] });
     assert!(bus.now < NO_TIME, "read in {:?}", bus.now);
 
     let base = LAYOUT.programs[0].base;
@@ -253,19 +256,19 @@ fn run<C: Choices>(choices: &str, product: &Product) -> Duration {
     image[..8].copy_from_slice(&[[0, 0, 1, 0x20], (base + 0x201).to_le_bytes()].concat());
     let label = Label::new(IDENTITY.vendor_id, IDENTITY.product_code, 1).emit();
     image[OFFSET as usize..][..SIZE].copy_from_slice(&label);
-    let checksum = if product.crc == CrcKind::Crc16 { Checksum::Crc16 } else { Checksum::Crc32 };
+    let checksum = if product.download.crc == CrcKind::Crc16 { Checksum::Crc16 } else { Checksum::Crc32 };
     let image = Firmware::Image(raw::read(&image, Some(base)).expect("an image"));
     let file = program_of(image, &Options::default().checksum(checksum)).expect("a program").program;
     let began = bus.now;
-    let mut adapter = SdoIds::new(&mut bus, product.sdo_request_base, product.sdo_response_base);
+    let mut adapter = SdoIds::new(&mut bus, product.sdo.request_base, product.sdo.response_base);
     let mut session = Session::new(&mut adapter, id, timing);
     // That of the profile of lifts; ESAcademy's is the tool's default.
     let password = product.profile.node_id.and_then(|_| Password::new("coboot"));
     let options = FlashOptions::default().start(false).unlock(password);
     let report = flash(&mut session, &file, &options, &mut |_| {}).expect("an update");
-    let form = if product.block_download { Transfers::Blocks } else { Transfers::Segments };
+    let form = if product.block_download.is_some() { Transfers::Blocks } else { Transfers::Segments };
     assert_eq!((report.transfers, report.repeats), (form, 0));
-    assert_eq!((bus.data, bus.refused), (bus.expected, u32::from(!product.block_download)));
+    assert_eq!((bus.data, bus.refused), (bus.expected, u32::from(product.block_download.is_none())));
     assert!(bus.data[0] > 8000 / 7, "{:?}", bus.data);
     bus.now - began
 }
@@ -273,14 +276,20 @@ fn run<C: Choices>(choices: &str, product: &Product) -> Duration {
 #[test]
 fn the_client_and_the_server_need_no_time_out_with_any_choice() {
     let mut of_default = None;
-    for (choices, mut product) in rows() {
+    let mut products = rows();
+    // The other value reads a pin.
+    products.retain(|(choices, _)| !choices.contains("programming_allowed"));
+    let sdo = Sdo { block_upload: false, ..Sdo::DEFAULT };
+    let segments = Product { block_download: None, sdo, ..Product::DEFAULT };
+    products.push(("no block transfer".to_owned(), segments));
+    for (choices, mut product) in products {
         // How the bootloader renews itself needs a chip.
-        product.renewal = false;
-        let took = match (product.block_download, product.block_upload) {
-            (true, true) => run::<Blocks<true, true>>(choices, &product),
-            (true, false) => run::<Blocks<true, false>>(choices, &product),
-            (false, true) => run::<Blocks<false, true>>(choices, &product),
-            (false, false) => run::<Blocks<false, false>>(choices, &product),
+        product.renewal = None;
+        let took = match (product.block_download.is_some(), product.sdo.block_upload) {
+            (true, true) => run::<Blocks<true, true>>(&choices, &product),
+            (true, false) => run::<Blocks<true, false>>(&choices, &product),
+            (false, true) => run::<Blocks<false, true>>(&choices, &product),
+            (false, false) => run::<Blocks<false, false>>(&choices, &product),
         };
         let of_default = *of_default.get_or_insert(took);
         // The procedure of a lift has pauses of its own.

@@ -141,7 +141,7 @@ fn node(
         *args = NodeArgs { node_id: node.id_or_none().into(), bit_rate: node.bit_rate.or_zero() };
         return Ok(());
     }
-    let is_allowed = |id: &u8| PRODUCT.node_ids.contains(id) || *id == NO_NODE_ID;
+    let is_allowed = |id: &u8| PRODUCT.node.ids.contains(id) || *id == NO_NODE_ID;
     let id = u8::try_from(args.node_id).ok().filter(is_allowed).ok_or(Status::BadArgument)?;
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id: NodeId::new(id), bit_rate: bit_rate.ok_or(Status::BadArgument)? };
@@ -172,7 +172,7 @@ fn own_info(flash: &ResidentFlash, record: Option<RenewalRecord>) -> ProgramArgs
 /// takes back both, or the confirmation alone. A confirmation clears the crash count.
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
-    if PRODUCT.renewal && number == BOOTLOADER && selector == Selector::ProgramInfo {
+    if product::RENEWS && number == BOOTLOADER && selector == Selector::ProgramInfo {
         *args = own_info(flash, RenewalRecord::load(&product::parameters(flash), flash));
         return Ok(());
     }

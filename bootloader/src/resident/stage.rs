@@ -125,9 +125,10 @@ fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
     if cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set() || in_handler()) {
         SCB::sys_reset();
     }
-    let is_marked = PRODUCT.two_resets && cell.is_marked();
+    let is_marked = PRODUCT.ways_in.two_resets && cell.is_marked();
     let request = cell.take();
-    if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && cause == ResetCause::Software {
+    if PRODUCT.ways_in.rom_loader && request == Some(BootRequest::RomLoader) && cause == ResetCause::Software
+    {
         // SAFETY: since the reset no interrupt was enabled and no bus master started.
         unsafe { enter_rom(rcc) };
     }
@@ -136,7 +137,7 @@ fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
         request,
         is_marked,
         strap: bsp::entry_strap(),
-        ended: if PRODUCT.renewal { ended(cause) } else { None },
+        ended: if product::RENEWS { ended(cause) } else { None },
         // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
         // Nothing has written it since the program started.
         program: unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) },
@@ -161,7 +162,7 @@ fn ended(cause: ResetCause) -> Option<Origin> {
 /// The places of the RAM image.
 fn images(flash: &ResidentFlash) -> Images<impl Fn(Region) -> Result<VectorTable, Damage> + '_> {
     let Places { home, staging } = match Places::of(LAYOUT) {
-        Some(places) if PRODUCT.renewal => places,
+        Some(places) if product::RENEWS => places,
         _ => Places { home: ram_image::home(), staging: Region::new(0, 0) },
     };
     // SAFETY: they are places of the layout.
@@ -228,7 +229,7 @@ unsafe fn enter_bootloader(
     // SAFETY: the caller guarantees it.
     unsafe { ram_image::copy(place) };
     drop(caches);
-    if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog_ms) {
+    if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog.bootloader_ms) {
         // An image that hangs before it starts the watchdog ends, too.
         bsp::watchdog::start(&chip.iwdg, ms);
     }
@@ -264,7 +265,7 @@ unsafe fn enter_program(
         // SAFETY: only this code runs, and it writes the flash no more.
         unsafe { crate::flash_lock::lock_flash() };
     }
-    if let Some(ms) = PRODUCT.program_watchdog_ms {
+    if let Some(ms) = PRODUCT.watchdog.program_ms {
         bsp::watchdog::start(&chip.iwdg, ms);
     } else if has_watchdog {
         bsp::watchdog::rescale(&chip.iwdg, bsp::watchdog::AFTER_RESET);
@@ -281,7 +282,7 @@ unsafe fn enter_program(
 fn date(start: &Start, parameters: &Parameters, flash: &ResidentFlash) -> u32 {
     let number = start.number;
     let record = || Some((ProgramRecord::load(parameters, flash, number)?, LAYOUT.program(number)?));
-    match PRODUCT.program_date.then(record).flatten() {
+    match PRODUCT.download.program_date.then(record).flatten() {
         Some((record, region)) => record.date(parameters, flash, number, region),
         None => 0,
     }
@@ -300,7 +301,7 @@ fn handoff(woken: &Woken, start: &Start, program_date: u32) -> Handoff {
         bootloader_version: product::VERSION,
         serial_number: product::serial_number(nameplate.as_ref()),
         bootloader_number: PRODUCT.bootloader_number(),
-        sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
+        sdo: SdoBases { request: PRODUCT.sdo.request_base, response: PRODUCT.sdo.response_base },
         program_date,
         nameplate: nameplate.is_some(),
     })

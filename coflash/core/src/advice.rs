@@ -166,9 +166,10 @@ advice! {
     RenewalFailed => "nothing is lost: look whether the file is the bootloader of this product and of its bit rate, and run \
                       the command again; a reset that nobody asked for has its cause in coflash info",
     /// For a bootloader on trial that does not answer.
-    SilentOnTrial => "nothing is lost: the old bootloader comes back by itself at the end of the trial (renewal_s of the \
-                      product, 60 s if it has no other), or at once when the device is switched off and on; for a product \
-                      with a longer time give that time and 15 s more, in ms, as --boot-timeout",
+    SilentOnTrial => "nothing is lost: the old bootloader comes back by itself at the end of the trial \
+                      (renewal.confirm_within_s of the product, 60 s if it has no other), or at once when the device is \
+                      switched off and on; for a product with a longer time give that time and 15 s more, in ms, as \
+                      --boot-timeout",
     /// For a device that takes sealed images alone.
     Seal => "seal the program with a key that a root of the device has certified (coflash seal), and flash the sealed image",
     /// For a program that is linked for another address.

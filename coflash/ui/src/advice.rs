@@ -69,8 +69,8 @@ pub(super) fn on_page(advice: &Advice) -> String {
              again; More … at the device has the cause of a reset that nobody asked for"
         }
         Advice::SilentOnTrial => {
-            "nothing is lost: the old bootloader comes back by itself at the end of the trial (renewal_s of the product, \
-             60 s if it has no other), or at once when the device is switched off and on"
+            "nothing is lost: the old bootloader comes back by itself at the end of the trial \
+             (renewal.confirm_within_s of the product, 60 s if it has no other), or at once when the device is switched off and on"
         }
         Advice::Seal => {
             "seal the program with a key that a root of the device has certified, and choose the sealed image"

@@ -297,12 +297,6 @@ pub enum Autostart {
 }
 
 impl Autostart {
-    /// Whether a program can start by itself.
-    #[must_use]
-    pub const fn is_on(self) -> bool {
-        !matches!(self, Self::List([]))
-    }
-
     /// The programs in the order in which they are tried; `programs`: those of the layout.
     fn order(self, programs: &'static [u8]) -> &'static [u8] {
         match self {

@@ -36,14 +36,14 @@ pub const STEPS: [Step; 21] = [
     ("bus-off: CAN_H and CAN_L shorted", bus_off),
     ("the crystal stopped", crystal),
     ("a jump that leaves the clocks wrong", leftovers),
-    ("a program that hangs, with program_watchdog_ms", hung_program),
+    ("a program that hangs, with watchdog.program_ms", hung_program),
 ];
 
 const V1: &str = "app-v1.elf";
 const V2: &str = "app-v2.elf";
 /// The template with 2000h, the way back.
 const TEST: &str = "app-test.elf";
-/// The bootloader of the product with `program_watchdog_ms: Some(1000)`.
+/// The bootloader of the product with `watchdog.program_ms: Some(1000)`.
 const WITH_WATCHDOG: &str = "bootloader-watchdog.elf";
 
 /// The time for the device to answer after its power is on or it was reset.

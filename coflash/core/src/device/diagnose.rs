@@ -89,7 +89,7 @@ impl fmt::Display for Diagnosis {
 /// one of a PDO would be a command to a machine.
 const OTHER_IDS: &str = "another tool may be using it, it needs a longer --sdo-timeout, or SDO has other \
                          COB-IDs there: give --sdo-request and --sdo-response as its product has them \
-                         (sdo_request_base, sdo_response_base)";
+                         (sdo.request_base, sdo.response_base)";
 
 impl Diagnosis {
     /// The conclusion from the frames that were heard.

@@ -266,7 +266,7 @@ impl Sealer<'_> {
                 Err(SealFault::Bootloader("it has no CRC: build it by `cargo xtask build`"))
             }
             () if header.counter != self.counter => Err(SealFault::Bootloader(
-                "its header has another security counter: the product chooses it (bootloader_counter)",
+                "its header has another security counter: the product chooses it (renewal.counter)",
             )),
             () if self.data || self.writes_flash || self.base.is_some() => {
                 Err(SealFault::Bootloader("it is no data, writes no flash, and has no dictionary"))

@@ -25,7 +25,7 @@ use crate::update::steps::{execute, identification};
 const LEAVES_WITHIN: Duration = Duration::from_millis(200);
 /// The old bootloader is usually back within this time: an image that nobody reaches, for example with
 /// another bit rate, ends after 60 s; the watchdog ends one that hangs earlier. A product may have another
-/// time (`renewal_s`), and no object has it: the user gives a longer one.
+/// time (`renewal.confirm_within_s`), and no object has it: the user gives a longer one.
 const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(75);
 
 /// See the [module](self).
