@@ -216,11 +216,11 @@ impl Row {
         let nodes = nodes.ok_or("node-IDs are 1 to 127")?;
         let fault = match nodes.as_slice() {
             _ if self.revision.is_some() || self.count.is_some() => {
-                "only a package has revision and count: leave them out, or make one (coflash package)"
+                "only a package has revision and count: leave them out, or make a package"
             }
             _ if self.program.is_some_and(|program| !(1..=254).contains(&program)) => "programs are 1 to 254",
             [] if self.lss.is_none() => {
-                "it has neither nodes nor lss; only the devices of a package are searched for (coflash package)"
+                "it has neither nodes nor lss; only the devices of a package are searched for"
             }
             [_, _, ..] if self.lss.is_some() => "one LSS address cannot get several node-IDs",
             [] => return Ok(vec![device(None)]),
