@@ -17,7 +17,7 @@ use seal::access::right;
 use shared_abi::geometry::Region;
 
 use crate::device::{Action, Device, Holder, Program, Seen, Stored, Trouble};
-use crate::files::{file, Content, Extent, Flaw, Part, Sent, NEWEST};
+use crate::files::{file, Content, Extent, Flaw, Part, Sent, NEW, NEWEST};
 use crate::mistakes::Mistake;
 use crate::model::Model;
 use crate::rules::{broken, History};
@@ -155,8 +155,6 @@ impl Report {
 
 /// The program before an update.
 pub const OLD: Content = Content::Program(1, Extent::Bytes(0xD8));
-/// The new one.
-pub const NEW: Content = Content::Program(1, Extent::Bytes(0xE0));
 /// The same with labels, which a lift wants.
 const OLD_LABELLED: Content = Content::Program(1, Extent::Bytes(0x208));
 const NEW_LABELLED: Content = Content::Program(1, Extent::Bytes(0x210));

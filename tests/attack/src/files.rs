@@ -134,6 +134,8 @@ pub enum Extent {
 pub const OLD: Content = Content::Image(0);
 /// The one that a tool installs at last.
 pub const NEWEST: Content = Content::Image(3);
+/// The program after an update.
+pub const NEW: Content = Content::Program(1, Extent::Bytes(0xE0));
 
 pub struct File {
     /// The bytes in flash.

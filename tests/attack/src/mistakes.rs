@@ -11,8 +11,7 @@ use kit::rig::{crc32, Node, Rig, Setup, AT_ONCE_2, BOARD_NODE, STANDARD_2};
 use shared_abi::geometry::Sector;
 use shared_abi::layout::Layout;
 
-use crate::cuts::NEW;
-use crate::files::file;
+use crate::files::{file, NEW};
 
 /// A mistake, in a device of [`STANDARD_2`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -42,7 +42,7 @@ use shared_abi::geometry::Region;
 pub use attack::play::Broken;
 use kit::model::ModelFlash;
 use kit::random::Random;
-use model::{Ask, Model, Node, NO_NODE};
+use model::{Ask, Model, Node, ANSWERS, NO_NODE, PARAMETERS};
 use setup::{Image, Setup};
 use target::{Happened, PowerCut, Target};
 
@@ -62,9 +62,7 @@ const PASSWORD_US: u64 = 33_000_000;
 /// 47 kHz at most (datasheet DocID022152).
 const FEED_US: u64 = 125 * 64 * 1_000_000 / 47_000;
 
-// The rules, as what must be true.
-const ANSWERS: &str = "the device answers in time, and what was asked alone";
-const PARAMETERS: &str = "node parameters are those that a master stored";
+// The rules, as what must be true; `model` has two of them.
 const PROGRAMS: &str = "a program changes if somebody asked for it alone";
 const RECORDS: &str = "the record of a program is true";
 const RESETS: &str = "a reset comes if somebody asked for it alone";

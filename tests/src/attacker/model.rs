@@ -3,11 +3,13 @@
 
 use std::collections::BTreeSet;
 
+use attack::play::Broken;
 use canopen::lss::LssAddress;
 use canopen::Frame;
 use embedded_can::Frame as _;
 
-use super::{Broken, ANSWERS, PARAMETERS};
+pub const ANSWERS: &str = "the device answers in time, and what was asked alone";
+pub const PARAMETERS: &str = "node parameters are those that a master stored";
 
 /// The start of a change of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -112,6 +112,20 @@ pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
     }
 }
 
+/// Checks that a device takes images that are not sealed; returns whether it has said so.
+///
+/// # Errors
+/// [`Error::SealedOnly`], and the errors of a [read](Session::read).
+pub(crate) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
+    match told_challenge(session)? {
+        Some(challenge) if challenge.is_sealed() => {
+            let roots = security_of(session, &challenge)?.roots;
+            Err(Error::SealedOnly { node: session.node(), roots })
+        }
+        challenge => Ok(challenge.is_some()),
+    }
+}
+
 /// The same for a device with this challenge.
 ///
 /// # Errors

@@ -11,7 +11,7 @@ use super::options::FlashOptions;
 use super::payload::{refusal_number, Payload};
 use super::steps::compare_target;
 use crate::advice::Advice;
-use crate::device::access::{security_of, told_challenge, Challenge};
+use crate::device::access::{security_of, takes_open, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Form, Session};
@@ -127,20 +127,6 @@ impl Question<'_> {
             Self::TakesSealed(file) => takes_sealed(session, file),
             Self::Size(file) => admit_size(session, file.head().size(), number),
         }
-    }
-}
-
-/// Checks that a device takes images that are not sealed; returns whether it has said so.
-///
-/// # Errors
-/// [`Error::SealedOnly`], and the errors of a [read](Session::read).
-pub(super) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
-    match told_challenge(session)? {
-        Some(challenge) if challenge.is_sealed() => {
-            let roots = security_of(session, &challenge)?.roots;
-            Err(Error::SealedOnly { node: session.node(), roots })
-        }
-        challenge => Ok(challenge.is_some()),
     }
 }
 

@@ -11,7 +11,7 @@
 //!
 //! `raw` and `hex` are one procedure. The renewal of a bootloader is one more, in every
 //! dialect. To add a dialect, add a row to [`Dialect`], and here
-//! a file that implements `Procedure` and a line in `of`.
+//! a file that implements `Procedure` and a line in `each.rs`.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
 use super::payload::Payload;
@@ -19,6 +19,7 @@ use crate::device::Dialect;
 
 mod block;
 mod cia302;
+mod each;
 mod esacademy;
 mod lift;
 mod procedure;
@@ -26,6 +27,7 @@ mod renew;
 mod restart;
 mod whole;
 
+pub(super) use self::each::of;
 pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
 pub use self::lift::read_locked;
 pub(super) use self::procedure::{Downloaded, Procedure};
@@ -43,16 +45,5 @@ pub(super) fn procedure(file: &Payload, dialect: Dialect) -> &'static dyn Proced
         &renew::Renew
     } else {
         of(dialect)
-    }
-}
-
-/// The procedure of this dialect for a program.
-pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
-    match dialect {
-        Dialect::Block => &block::Block,
-        Dialect::Raw => &cia302::Cia302(Dialect::Raw),
-        Dialect::Hex => &cia302::Cia302(Dialect::Hex),
-        Dialect::Lift => &lift::Lift,
-        Dialect::EsAcademy => &esacademy::EsAcademy,
     }
 }

@@ -6,12 +6,13 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
+use super::each::of;
 use super::procedure::{call_back, Downloaded, Procedure};
 use super::whole::{self, Whole};
+use crate::device::access::takes_open;
 use crate::device::error::told;
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::{Dialect, Doing, Error, Form, Session};
-use crate::update::admission::takes_open;
 use crate::update::device_after::DeviceState;
 use crate::update::event::Phase;
 use crate::update::options::FlashOptions;
@@ -40,7 +41,7 @@ impl Procedure for Renew {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         match found.dialect {
-            Dialect::Lift => super::of(Dialect::Lift).enter(session, found, update),
+            Dialect::Lift => of(Dialect::Lift).enter(session, found, update),
             _ => call_back(session, found, update),
         }
     }
@@ -65,7 +66,7 @@ impl Procedure for Renew {
         let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
         let again = update.called.filter(|_| update.options.start && !is_silent).map(|program| {
             update.tell(Phase::Starting.into());
-            super::of(update.dialect).start(session, update.original, program)
+            of(update.dialect).start(session, update.original, program)
         });
         let renewal = result?;
         let running = again.transpose()?;
@@ -135,7 +136,7 @@ fn renew(
 
 /// Writes the password of the bootloader, if it has one: also after each reset.
 fn unlock(session: &mut Session<'_>, number: u8, update: &RunningUpdate<'_>) -> Result<(), Error> {
-    super::of(update.dialect).unlock(session, update.options.unlock, number).map(drop)
+    of(update.dialect).unlock(session, update.options.unlock, number).map(drop)
 }
 
 /// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
