@@ -15,19 +15,21 @@
 //! reported when asked for. MSR.SAMP and MSR.RX always read recessive.
 
 pub mod filters;
+mod mailboxes;
 pub mod pins;
+mod registers;
 #[cfg(test)]
 mod tests;
 
-use std::collections::VecDeque;
-
 use crate::bus::confinement::{Confinement, ErrorState};
 use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Pins, Wait};
-use crate::frame::{ExtendedId, Frame, Id, StandardId, INTERMISSION_BITS};
+use crate::frame::{Frame, INTERMISSION_BITS};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::silicon::{self, Silicon};
 use crate::time::{Span, Time};
 use filters::{Filters, Share};
+use mailboxes::{Fifo, Mailbox, MailboxState, RxMailbox};
+use registers::{btr, esr, ier, ir, mcr, msr, tsr};
 
 /// Interrupt lines of a controller (RM0090, table 61).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,91 +48,6 @@ pub struct Lines {
 pub const CAN1_LINES: Lines = Lines { tx: 19, rx0: 20, rx1: 21, sce: 22 };
 /// Those of CAN2.
 pub const CAN2_LINES: Lines = Lines { tx: 63, rx0: 64, rx1: 65, sce: 66 };
-
-/// CAN_MCR.
-mod mcr {
-    pub const INRQ: u32 = 1 << 0;
-    pub const SLEEP: u32 = 1 << 1;
-    pub const TXFP: u32 = 1 << 2;
-    pub const RFLM: u32 = 1 << 3;
-    pub const NART: u32 = 1 << 4;
-    pub const AWUM: u32 = 1 << 5;
-    pub const ABOM: u32 = 1 << 6;
-    pub const TTCM: u32 = 1 << 7;
-    pub const RESET: u32 = 1 << 15;
-    pub const DBF: u32 = 1 << 16;
-    pub const AFTER_RESET: u32 = DBF | SLEEP;
-    pub const KEPT: u32 = INRQ | SLEEP | TXFP | RFLM | NART | AWUM | ABOM | TTCM | DBF;
-}
-
-/// CAN_MSR.
-mod msr {
-    pub const INAK: u32 = 1 << 0;
-    pub const SLAK: u32 = 1 << 1;
-    pub const ERRI: u32 = 1 << 2;
-    pub const WKUI: u32 = 1 << 3;
-    pub const SLAKI: u32 = 1 << 4;
-    pub const TXM: u32 = 1 << 8;
-    pub const RXM: u32 = 1 << 9;
-    pub const SAMP: u32 = 1 << 10;
-    pub const RX: u32 = 1 << 11;
-}
-
-/// One byte of CAN_TSR: the flags of one mailbox.
-mod tsr {
-    pub const RQCP: u32 = 1 << 0;
-    pub const TXOK: u32 = 1 << 1;
-    pub const ALST: u32 = 1 << 2;
-    pub const TERR: u32 = 1 << 3;
-    pub const ABRQ: u32 = 1 << 7;
-}
-
-/// CAN_RFxR.
-mod rfr {
-    pub const FULL: u32 = 1 << 3;
-    pub const FOVR: u32 = 1 << 4;
-    pub const RFOM: u32 = 1 << 5;
-}
-
-/// CAN_IER.
-mod ier {
-    pub const TMEIE: u32 = 1 << 0;
-    /// FMPIE0; FIFO 1 has the same three bits, three places higher.
-    pub const FMPIE: u32 = 1 << 1;
-    pub const FFIE: u32 = 1 << 2;
-    pub const FOVIE: u32 = 1 << 3;
-    pub const EWGIE: u32 = 1 << 8;
-    pub const EPVIE: u32 = 1 << 9;
-    pub const BOFIE: u32 = 1 << 10;
-    pub const LECIE: u32 = 1 << 11;
-    pub const ERRIE: u32 = 1 << 15;
-    pub const WKUIE: u32 = 1 << 16;
-    pub const SLKIE: u32 = 1 << 17;
-    pub const ALL: u32 = 0x0003_8F7F;
-}
-
-/// CAN_ESR.
-mod esr {
-    pub const EWGF: u32 = 1 << 0;
-    pub const EPVF: u32 = 1 << 1;
-    pub const BOFF: u32 = 1 << 2;
-    pub const LEC_SHIFT: u32 = 4;
-}
-
-/// CAN_BTR.
-mod btr {
-    pub const LBKM: u32 = 1 << 30;
-    pub const SILM: u32 = 1 << 31;
-    pub const ALL: u32 = LBKM | SILM | 3 << 24 | 7 << 20 | 15 << 16 | 0x3FF;
-    pub const AFTER_RESET: u32 = 0x0123_0000;
-}
-
-/// CAN_TIxR and CAN_RIxR.
-mod ir {
-    pub const TXRQ: u32 = 1 << 0;
-    pub const RTR: u32 = 1 << 1;
-    pub const IDE: u32 = 1 << 2;
-}
 
 /// CAN_TDTxR.TGT.
 const TGT: u32 = 1 << 8;
@@ -177,162 +94,6 @@ enum Activity {
     Idle,
     Transmitting,
     Receiving,
-}
-
-/// A transmit mailbox (RM0090, 32.7.1).
-#[derive(Clone, Copy, Debug, Default)]
-struct Mailbox {
-    tir: u32,
-    tdtr: u32,
-    tdlr: u32,
-    tdhr: u32,
-    /// RQCP, TXOK, ALST, TERR.
-    flags: u32,
-    state: MailboxState,
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum MailboxState {
-    #[default]
-    Empty,
-    /// TXRQ is set. `order` counts the requests of the controller.
-    Pending { since: Time, order: u64 },
-    /// Its frame is on the wire; `abort`: ABRQ waits for the outcome.
-    Transmit { since: Time, order: u64, abort: bool },
-}
-
-impl Mailbox {
-    fn frame(&self) -> Frame {
-        let dlc = (self.tdtr & 0xF) as u8;
-        let id = if self.tir & ir::IDE == 0 {
-            StandardId::new((self.tir >> 21) as u16).map(Id::Standard)
-        } else {
-            ExtendedId::new(self.tir >> 3).map(Id::Extended)
-        };
-        // 32 bits less the 21 or 3 shifted out fit 11 or 29.
-        let id = id.unwrap_or(Id::Standard(StandardId::MAX));
-        let frame = if self.tir & ir::RTR == 0 {
-            let mut data = [0; 8];
-            data[..4].copy_from_slice(&self.tdlr.to_le_bytes());
-            data[4..].copy_from_slice(&self.tdhr.to_le_bytes());
-            let data = &data[..usize::from(dlc).min(data.len())];
-            Frame::data_frame(id, data).and_then(|frame| frame.with_dlc(dlc))
-        } else {
-            Frame::remote_frame(id, dlc)
-        };
-        frame.expect("the DLC has four bits")
-    }
-
-    fn order(&self) -> Option<u64> {
-        match self.state {
-            MailboxState::Empty => None,
-            MailboxState::Pending { order, .. } | MailboxState::Transmit { order, .. } => Some(order),
-        }
-    }
-
-    /// The request is over.
-    fn complete(&mut self) {
-        self.state = MailboxState::Empty;
-        self.flags |= tsr::RQCP;
-    }
-}
-
-/// A received frame as its four registers show it.
-#[derive(Clone, Copy, Debug)]
-struct RxMailbox {
-    rir: u32,
-    rdtr: u32,
-    rdlr: u32,
-    rdhr: u32,
-}
-
-impl Default for RxMailbox {
-    /// After a reset: undefined (RM0090, 32.9.3).
-    fn default() -> Self {
-        const ANY: u32 = 0xA5A5_A5A5;
-        Self { rir: ANY, rdtr: ANY, rdlr: ANY, rdhr: ANY }
-    }
-}
-
-impl RxMailbox {
-    /// A frame after another one, of which the data registers keep the bytes that this one does not have.
-    fn new(frame: &Frame, filter_index: u8, stamp: u32, before: &Self) -> Self {
-        let id = match frame.id() {
-            Id::Standard(id) => u32::from(id.as_raw()) << 21,
-            Id::Extended(id) => id.as_raw() << 3 | ir::IDE,
-        };
-        let word = |at: usize, before: u32| {
-            let mut bytes = before.to_le_bytes();
-            for (to, from) in bytes.iter_mut().zip(frame.data().iter().skip(at)) {
-                *to = *from;
-            }
-            u32::from_le_bytes(bytes)
-        };
-        Self {
-            rir: id | if frame.is_remote() { ir::RTR } else { 0 },
-            rdtr: stamp | u32::from(filter_index) << 8 | u32::from(frame.dlc()),
-            rdlr: word(0, before.rdlr),
-            rdhr: word(4, before.rdhr),
-        }
-    }
-}
-
-/// A receive FIFO of three frames (RM0090, 32.7.3).
-#[derive(Clone, Debug, Default)]
-struct Fifo {
-    frames: VecDeque<RxMailbox>,
-    /// What the output mailbox shows when nothing is in the FIFO: the last frame released.
-    stale: RxMailbox,
-    full: bool,
-    overrun: bool,
-}
-
-const FIFO_DEPTH: usize = 3;
-
-impl Fifo {
-    fn store(&mut self, frame: RxMailbox, locked: bool) {
-        if self.frames.len() == FIFO_DEPTH {
-            self.overrun = true;
-            if locked {
-                return;
-            }
-            self.frames.pop_back();
-        }
-        self.frames.push_back(frame);
-        self.full |= self.frames.len() == FIFO_DEPTH;
-    }
-
-    fn release(&mut self) {
-        if let Some(frame) = self.frames.pop_front() {
-            self.stale = frame;
-        }
-    }
-
-    fn output(&self) -> &RxMailbox {
-        self.frames.front().unwrap_or(&self.stale)
-    }
-
-    fn read_status(&self) -> u32 {
-        // At most FIFO_DEPTH.
-        let pending = self.frames.len() as u32;
-        pending | if self.full { rfr::FULL } else { 0 } | if self.overrun { rfr::FOVR } else { 0 }
-    }
-
-    fn write_status(&mut self, value: u32) {
-        self.full &= value & rfr::FULL == 0;
-        self.overrun &= value & rfr::FOVR == 0;
-        if value & rfr::RFOM != 0 {
-            self.release();
-        }
-    }
-
-    /// Whether an interrupt is active; `enabled`: FMPIE, FFIE and FOVIE of this FIFO at their FIFO
-    /// 0 places.
-    fn interrupt(&self, enabled: u32) -> bool {
-        enabled & ier::FMPIE != 0 && !self.frames.is_empty()
-            || enabled & ier::FFIE != 0 && self.full
-            || enabled & ier::FOVIE != 0 && self.overrun
-    }
 }
 
 /// A controller: CAN1 or CAN2.

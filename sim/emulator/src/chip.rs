@@ -1,193 +1,43 @@
 //! Everything of the chip except the instruction set: memories, peripherals, clocks, and the
 //! address map.
 
+mod accesses;
+pub(crate) mod memory_map;
+
 use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bus::node::Pins;
 use crate::bxcan::{self, BxCan};
 use crate::clock::CycleClock;
-use crate::cortex::debug::{Debug, COMPARATORS};
+use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
-use crate::cortex::scs::{Effect, Scs};
-use crate::costs::CRC_WORD;
+use crate::cortex::scs::Scs;
 use crate::memory::{HostMemory, PAGE};
 use crate::options::Options;
 use crate::periph::crc::Crc;
 use crate::periph::exti::Exti;
-use crate::periph::flash::{Flash, Store};
+use crate::periph::flash::Flash;
 use crate::periph::gpio::Gpio;
 use crate::periph::i2c::I2c;
 use crate::periph::iwdg::Iwdg;
-use crate::periph::otg::{self, Otg};
+use crate::periph::otg::Otg;
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
 use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
 use crate::periph::wwdg::Wwdg;
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::Peripheral;
 use crate::report::{Access, Report, Reports};
 use crate::silicon::Silicon;
 use crate::slice::Slice;
 use crate::supply::{self, Supervisor, Supply};
 use crate::time::{Span, Time};
 use crate::variant::{self, Variant};
-
-/// Where flash (or whatever the boot pins choose) shows up for the reset vector.
-pub const BOOT_ALIAS: u32 = 0;
-/// The pages of the system memory, and behind it of the unique ID and the flash size.
-pub const SYSTEM: Region = Region::new(SYSTEM_MEMORY.base, 8 * PAGE);
-/// The one-time programmable bytes, 16 blocks of 32 and a lock byte for each (RM0090 section 3.8).
-pub const OTP: Region = Region::new(0x1FFF_7800, OTP_BLOCKS * OTP_BLOCK + OTP_BLOCKS);
-const OTP_BLOCKS: u32 = 16;
-const OTP_BLOCK: u32 = 32;
-const UNIQUE_ID: u32 = 0x1FFF_7A10;
-const FLASH_SIZE: u32 = 0x1FFF_7A22;
-/// Page of the option bytes.
-pub const OPTION_PAGE: Region = Region::new(0x1FFF_C000, PAGE);
-/// AHB1 and APB peripherals.
-pub const PERIPHERALS: Region = Region::new(0x4000_0000, 0x0008_0000);
-/// AHB2: USB OTG FS, DCMI, crypto, RNG.
-pub const PERIPHERALS_AHB2: Region = Region::new(0x5000_0000, 0x0006_1000);
-/// Private peripheral bus: DWT, FPB, system control space, DBGMCU.
-pub const PRIVATE: Region = Region::new(0xE000_0000, 0x0010_0000);
-const ITM: u32 = 0xE000_0000;
-const DWT: u32 = 0xE000_1000;
-const FPB: u32 = 0xE000_2000;
-const SCS: u32 = 0xE000_E000;
-const DBGMCU: u32 = 0xE004_2000;
-
-/// Where loads from hidden sectors of the flash go (PCROP); an address of external memory, which no chip here has.
-pub const HIDDEN: Region = Region::new(0x9000_0000, 0x0020_0000);
-/// Where the pages are whose words the FPB replaces, one for each comparator; another such address.
-pub const PATCHED: Region = Region::new(0x9100_0000, COMPARATORS as u32 * PAGE);
-/// What a bank of the flash has, on a chip whose banks can be swapped.
-const BANK: u32 = 0x0010_0000;
-
-/// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM
-/// is mapped.
-pub const SRAM_ALIAS: u32 = 0x2200_0000;
-/// Bit-band alias of the first MiB of peripheral space.
-pub const PERIPHERAL_ALIAS: Region = Region::new(0x4200_0000, 0x0200_0000);
-
-/// A modelled block.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Block {
-    Crc,
-    Rcc,
-    Flash,
-    Gpio(usize),
-    Iwdg,
-    Wwdg,
-    Pwr,
-    Syscfg,
-    Exti,
-    Can1,
-    Can2,
-    Usart(usize),
-    Tim(usize),
-    I2c(usize),
-    Otg,
-}
-
-/// The block that answers at an address, with the offset in its registers.
-enum Place {
-    Block { block: Block, offset: u32, enable: ClockEnable },
-    Scs(u32),
-    Dwt(u32),
-    Fpb(u32),
-    Dbgmcu(u32),
-    Itm,
-    Nobody,
-}
-
-/// Where RCC enables the clock of a block: register offset and bit; `None` for a block that is
-/// always clocked.
-type ClockEnable = Option<(u32, u32)>;
-
-/// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 45] = [
-    (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
-    (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
-    (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
-    (0x4000_0C00, Block::Tim(3), Some((rcc::APB1ENR, 3))),
-    (0x4000_1000, Block::Tim(4), Some((rcc::APB1ENR, 4))),
-    (0x4000_1400, Block::Tim(5), Some((rcc::APB1ENR, 5))),
-    (0x4000_1800, Block::Tim(9), Some((rcc::APB1ENR, 6))),
-    (0x4000_1C00, Block::Tim(10), Some((rcc::APB1ENR, 7))),
-    (0x4000_2000, Block::Tim(11), Some((rcc::APB1ENR, 8))),
-    (0x4000_2C00, Block::Wwdg, Some((rcc::APB1ENR, 11))),
-    (0x4000_3000, Block::Iwdg, None),
-    (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
-    (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
-    (0x4000_4C00, Block::Usart(3), Some((rcc::APB1ENR, 19))),
-    (0x4000_5000, Block::Usart(4), Some((rcc::APB1ENR, 20))),
-    (0x4000_5400, Block::I2c(0), Some((rcc::APB1ENR, 21))),
-    (0x4000_5800, Block::I2c(1), Some((rcc::APB1ENR, 22))),
-    (0x4000_5C00, Block::I2c(2), Some((rcc::APB1ENR, 23))),
-    (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
-    (0x4000_6800, Block::Can2, Some((rcc::APB1ENR, 26))),
-    (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
-    (0x4001_0000, Block::Tim(12), Some((rcc::APB2ENR, 0))),
-    (0x4001_0400, Block::Tim(13), Some((rcc::APB2ENR, 1))),
-    (0x4001_1000, Block::Usart(0), Some((rcc::APB2ENR, 4))),
-    (0x4001_1400, Block::Usart(5), Some((rcc::APB2ENR, 5))),
-    (0x4001_3800, Block::Syscfg, Some((rcc::APB2ENR, 14))),
-    (0x4001_3C00, Block::Exti, None),
-    (0x4001_4000, Block::Tim(6), Some((rcc::APB2ENR, 16))),
-    (0x4001_4400, Block::Tim(7), Some((rcc::APB2ENR, 17))),
-    (0x4001_4800, Block::Tim(8), Some((rcc::APB2ENR, 18))),
-    (0x4002_0000, Block::Gpio(0), Some((rcc::AHB1ENR, 0))),
-    (0x4002_0400, Block::Gpio(1), Some((rcc::AHB1ENR, 1))),
-    (0x4002_0800, Block::Gpio(2), Some((rcc::AHB1ENR, 2))),
-    (0x4002_0C00, Block::Gpio(3), Some((rcc::AHB1ENR, 3))),
-    (0x4002_1000, Block::Gpio(4), Some((rcc::AHB1ENR, 4))),
-    (0x4002_1400, Block::Gpio(5), Some((rcc::AHB1ENR, 5))),
-    (0x4002_1800, Block::Gpio(6), Some((rcc::AHB1ENR, 6))),
-    (0x4002_1C00, Block::Gpio(7), Some((rcc::AHB1ENR, 7))),
-    (0x4002_2000, Block::Gpio(8), Some((rcc::AHB1ENR, 8))),
-    (0x4002_2400, Block::Gpio(9), Some((rcc::AHB1ENR, 9))),
-    (0x4002_2800, Block::Gpio(10), Some((rcc::AHB1ENR, 10))),
-    (0x4002_3000, Block::Crc, Some((rcc::AHB1ENR, 12))),
-    (0x4002_3800, Block::Rcc, None),
-    (0x4002_3C00, Block::Flash, None),
-    (0x5000_0000, Block::Otg, Some((rcc::AHB2ENR, 7))),
-];
-
-impl Block {
-    /// Bytes of its registers.
-    fn size(self) -> u32 {
-        match self {
-            Self::Otg => otg::SIZE,
-            _ => 0x400,
-        }
-    }
-}
-
-const RCC_CFGR: u32 = 0x4002_3808;
-const SYSCFG_MEMRMP: u32 = 0x4001_3800;
-
-/// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 18] = [
-    (0x4000_2800, "RTC"),
-    (0x4000_3400, "I2S2ext"),
-    (0x4000_3800, "SPI2"),
-    (0x4000_3C00, "SPI3"),
-    (0x4000_4000, "I2S3ext"),
-    (0x4000_7400, "DAC"),
-    (0x4001_2000, "ADC"),
-    (0x4001_2C00, "SDIO"),
-    (0x4001_3000, "SPI1"),
-    (0x4002_4000, "the backup SRAM"),
-    (0x4002_6000, "DMA1"),
-    (0x4002_6400, "DMA2"),
-    (0x4002_8000, "Ethernet"),
-    (0x4004_0000, "USB OTG HS"),
-    (0x5000_1000, "a FIFO of USB OTG FS"),
-    (0x5005_0000, "DCMI"),
-    (0x5006_0000, "CRYP/HASH"),
-    (0x5006_0800, "RNG"),
-];
+use memory_map::{
+    Block, BANK, BLOCKS, FLASH_SIZE, OPTION_PAGE, OTP, OTP_BLOCK, OTP_BLOCKS, PATCHED, RCC_CFGR, SYSTEM,
+    UNIQUE_ID,
+};
 
 /// The counters of the machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -381,6 +231,31 @@ impl Chip {
         self.swaps_banks().then(|| swap(address))
     }
 
+    /// The memory block of `address`, with the offset in it. Only plain memory, no peripherals.
+    #[must_use]
+    pub fn memory(&self, address: u32) -> Option<(&HostMemory, usize)> {
+        let geometry = self.geometry;
+        let address = self.behind_alias(address).unwrap_or(address);
+        for (region, memory) in [
+            (geometry.sram, &self.sram),
+            (geometry.flash, &self.flash.array),
+            (geometry.ccm, &self.ccm),
+            (SYSTEM, &self.system),
+            (OPTION_PAGE, &self.options),
+        ] {
+            if region.contains(address, 1) {
+                return Some((memory, (address - region.base) as usize));
+            }
+        }
+        None
+    }
+
+    /// Whether an address is in the flash, or in its alias.
+    #[must_use]
+    pub fn is_flash(&self, address: u32) -> bool {
+        self.geometry.flash.contains(self.behind_alias(address).unwrap_or(address), 1)
+    }
+
     /// Whether the second bank of the flash is in the place of the first.
     #[must_use]
     pub fn swaps_banks(&self) -> bool {
@@ -549,26 +424,11 @@ impl Chip {
 
     fn reset_core_domain(&mut self, cause: ResetCause) {
         self.is_halved = false;
-        let (crc, syscfg): (&mut dyn Peripheral, _) = (&mut self.crc, &mut self.syscfg);
-        for block in [crc, syscfg, &mut self.exti, &mut self.wwdg, &mut self.rcc, &mut self.flash] {
-            block.reset();
+        for (_, block, _) in self.blocks() {
+            if !matches!(block, Block::Iwdg | Block::Pwr) {
+                self.block_mut(block).reset();
+            }
         }
-        for can in &mut self.can {
-            can.reset();
-        }
-        for port in &mut self.gpio {
-            port.reset();
-        }
-        for usart in &mut self.usarts {
-            usart.reset();
-        }
-        for tim in &mut self.tims {
-            tim.reset();
-        }
-        for i2c in &mut self.i2c {
-            i2c.reset();
-        }
-        self.otg.reset();
         if self.flash.boots_from_system_memory() {
             self.syscfg.boot_from_system_memory();
         }
@@ -822,418 +682,5 @@ impl Chip {
     pub fn report(&mut self, access: Access, address: u32, size: u8, value: u32, pc: u32, what: String) {
         let time = self.now();
         self.reports.add(Report { time, address, pc, size, access, value, what, count: 1 });
-    }
-
-    // --- accesses by the CPU
-    // -----------------------------------------------------------------------------------------
-
-    /// The CPU loads `size` bytes (1, 2 or 4) from a peripheral address.
-    pub fn load(&mut self, address: u32, size: u8) -> u32 {
-        let result = if PERIPHERAL_ALIAS.contains(address, 1) {
-            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
-            self.load_word(word).map(|value| value >> bit & 1)
-        } else {
-            self.load_word(address & !3).map(|word| word >> (8 * (address & 3)) & mask(size))
-        };
-        result.unwrap_or_else(|unmodelled| {
-            self.complain(Access::Read, address, size, 0, unmodelled);
-            0
-        })
-    }
-
-    /// The CPU stores `size` bytes to a peripheral address.
-    pub fn store(&mut self, address: u32, size: u8, value: u32) {
-        let result = if PERIPHERAL_ALIAS.contains(address, 1) {
-            // The bus matrix reads the word, changes the bit, writes the word (PM0214 section
-            // 2.2.5).
-            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
-            self.change_word(word, 1 << bit, (value & 1) << bit)
-        } else if size == 4 || address & 3 == 0 && self.takes_halves(address) {
-            self.store_word(address, value)
-        } else {
-            let shift = 8 * (address & 3);
-            self.change_word(address & !3, mask(size) << shift, value << shift)
-        };
-        if let Err(unmodelled) = result {
-            self.complain(Access::Write, address, size, value, unmodelled);
-        }
-        if address & !3 == SYSCFG_MEMRMP {
-            // Other memory may be at address 0 from now on.
-            self.slice.flush_tlb = true;
-            self.slice.leave = true;
-        }
-        if self.flash.take_bus_error() {
-            self.slice.bus_error = Some(address);
-        }
-        self.after_write();
-    }
-
-    /// Whether a register is one of those that a half-word is all of, so that writing it reads
-    /// nothing.
-    fn takes_halves(&self, address: u32) -> bool {
-        matches!(self.place(address), Place::Block { block: Block::Usart(_), .. })
-    }
-
-    fn change_word(&mut self, address: u32, mask: u32, value: u32) -> Result<(), Unmodelled> {
-        let old = self.load_word(address)?;
-        self.store_word(address, old & !mask | value & mask)
-    }
-
-    fn complain(&mut self, access: Access, address: u32, size: u8, value: u32, unmodelled: Unmodelled) {
-        let Unmodelled(mut what) = unmodelled;
-        if PERIPHERAL_ALIAS.contains(address, 1) {
-            let (word, bit) = bit_band(PERIPHERALS.base, address - PERIPHERAL_ALIAS.base);
-            what.push_str(&format!(" (the alias of bit {bit} of the register at {word:08X}h)"));
-        }
-        let time = self.now();
-        self.slice.unlocated.push(Report { time, address, pc: 0, size, access, value, what, count: 1 });
-    }
-
-    /// Word-sized bit-band access to SRAM: (offset of the byte, bit).
-    #[must_use]
-    pub fn sram_bit(&self, address: u32) -> Option<(usize, u32)> {
-        let offset = address.checked_sub(SRAM_ALIAS)?;
-        let byte = (offset / 32) as usize;
-        (byte < self.sram.size()).then_some((byte, offset / 4 % 8))
-    }
-
-    /// The block that answers at a word-aligned peripheral address.
-    fn place(&self, address: u32) -> Place {
-        let within = |base: u32, size: u32| Some(address.wrapping_sub(base)).filter(|&offset| offset < size);
-        let there = |block: Block| !matches!(block, Block::Gpio(port) if port >= self.gpio.len());
-        let block =
-            BLOCKS.iter().filter(|&&(_, block, _)| there(block)).find_map(|&(base, block, enable)| {
-                within(base, block.size()).map(|offset| Place::Block { block, offset, enable })
-            });
-        block
-            .or_else(|| within(SCS, PAGE).map(Place::Scs))
-            .or_else(|| within(DWT, PAGE).map(Place::Dwt))
-            .or_else(|| within(FPB, PAGE).map(Place::Fpb))
-            .or_else(|| within(DBGMCU, 0x10).map(Place::Dbgmcu))
-            .or_else(|| within(ITM, PAGE).map(|_| Place::Itm))
-            .unwrap_or(Place::Nobody)
-    }
-
-    fn block_mut(&mut self, block: Block) -> &mut dyn Peripheral {
-        match block {
-            Block::Crc => &mut self.crc,
-            Block::Rcc => &mut self.rcc,
-            Block::Flash => &mut self.flash,
-            Block::Gpio(port) => &mut self.gpio[port],
-            Block::Iwdg => &mut self.iwdg,
-            Block::Wwdg => &mut self.wwdg,
-            Block::Pwr => &mut self.pwr,
-            Block::Syscfg => &mut self.syscfg,
-            Block::Exti => &mut self.exti,
-            Block::Can1 => &mut self.can[0],
-            Block::Can2 => &mut self.can[1],
-            Block::Usart(index) => &mut self.usarts[index],
-            Block::Tim(index) => &mut self.tims[index],
-            Block::I2c(index) => &mut self.i2c[index],
-            Block::Otg => &mut self.otg,
-        }
-    }
-
-    fn has_clock(&self, enable: ClockEnable) -> bool {
-        enable.is_none_or(|(register, bit)| self.rcc.plain(register) & 1 << bit != 0)
-    }
-
-    /// The same while the core may be asleep: the low-power enable bits are 20h after the others (sections
-    /// 7.3.15 to 7.3.19).
-    fn is_clocked(&self, enable: ClockEnable) -> bool {
-        let sleeps_on =
-            |(register, bit): (u32, u32)| !self.is_halved || self.rcc.plain(register + 0x20) & 1 << bit != 0;
-        self.has_clock(enable) && enable.is_none_or(sleeps_on)
-    }
-
-    /// The core falls asleep or wakes up: a block whose low-power enable bit is 0 stands still meanwhile.
-    /// All blocks that do something by themselves are at APB1 and APB2.
-    pub fn core_sleeps(&mut self, sleeps: bool) {
-        let stops = |register| self.rcc.plain(register) & !self.rcc.plain(register + 0x20) != 0;
-        let is_halved = sleeps && (stops(rcc::APB1ENR) || stops(rcc::APB2ENR));
-        if is_halved != self.is_halved {
-            self.is_halved = is_halved;
-            self.apply_clocks();
-        }
-    }
-
-    fn unknown(address: u32) -> Unmodelled {
-        let block = UNMODELLED.iter().rev().find(|&&(base, _)| address >= base && address - base < 0x1_0000);
-        Unmodelled(match block {
-            Some(&(base, name)) => {
-                format!("{name} is not modelled (offset {:X}h); it reads as 0", address - base)
-            }
-            None => "no peripheral is known here; it reads as 0".into(),
-        })
-    }
-
-    fn load_word(&mut self, address: u32) -> Result<u32, Unmodelled> {
-        let now = self.now();
-        let result = match self.place(address) {
-            Place::Block { block, offset, enable } if self.has_clock(enable) => {
-                self.block_mut(block).read(offset, now)
-            }
-            Place::Block { block, .. } => {
-                let name = self.block_mut(block).name();
-                Err(Unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0")))
-            }
-            Place::Scs(offset) => {
-                let now = self.clock.time_of(self.cycle_of_access());
-                if self.scs.systick.advance(now) {
-                    self.scs.exceptions.pend(SYS_TICK);
-                }
-                self.scs.read(offset, now)
-            }
-            Place::Dwt(offset) => self.scs.read_dwt(offset, self.cycle_of_access()),
-            Place::Fpb(offset) => self.scs.debug.read_fpb(offset),
-            Place::Dbgmcu(0) => Ok(self.variant.idcode),
-            Place::Dbgmcu(offset) => Ok(self.dbgmcu[offset as usize / 4 - 1]),
-            // Stimulus ports that nobody listens to are ready.
-            Place::Itm => Ok(1),
-            Place::Nobody => Err(Self::unknown(address)),
-        };
-        self.settle_flash();
-        result
-    }
-
-    /// The word of a register as a load would give it, whether its block has a clock or not; `None`
-    /// where nothing is modelled. What a load does to the register is done.
-    pub fn register(&mut self, address: u32) -> Option<u32> {
-        let now = self.now();
-        match self.place(address & !3) {
-            Place::Block { block, offset, .. } => self.block_mut(block).read(offset, now).ok(),
-            _ => self.load_word(address & !3).ok(),
-        }
-    }
-
-    fn store_word(&mut self, address: u32, value: u32) -> Result<(), Unmodelled> {
-        let now = self.now();
-        match self.place(address) {
-            Place::Block { block, offset, enable } if self.has_clock(enable) => {
-                self.store_block(block, offset, value, now)
-            }
-            Place::Block { block, .. } => {
-                let name = self.block_mut(block).name();
-                Err(Unmodelled(format!("{name} has no clock (RCC enables it); the write is lost")))
-            }
-            Place::Scs(offset) => {
-                let now = self.clock.time_of(self.cycle_of_access());
-                self.store_scs(offset, value, now)
-            }
-            Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.cycle_of_access()),
-            Place::Fpb(offset) => {
-                self.slice.breakpoints_changed = true;
-                self.slice.flush_tlb = true;
-                self.slice.leave = true;
-                self.scs.debug.write_fpb(offset, value)
-            }
-            Place::Dbgmcu(0) | Place::Itm => Ok(()),
-            Place::Dbgmcu(offset) => {
-                self.dbgmcu[offset as usize / 4 - 1] = value;
-                Ok(())
-            }
-            Place::Nobody => Err(Self::unknown(address)),
-        }
-    }
-
-    fn store_block(&mut self, block: Block, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
-        let resets_before = self.reset_bits();
-        if block == Block::Exti && !self.exti.listens() {
-            let levels = self.exti_levels();
-            self.exti.settle(levels);
-        }
-        let caches_data = self.flash.caches_data();
-        let result = self.block_mut(block).write(offset, value, now);
-        match block {
-            Block::Rcc => {
-                self.reset_blocks(resets_before);
-                let changed = self.rcc.clocks() != self.clocks;
-                if changed || offset == rcc::APB1ENR || offset == rcc::APB2ENR {
-                    self.apply_clocks();
-                    self.slice.leave = true;
-                }
-                if changed {
-                    self.check_clocks();
-                }
-                self.follow_watchdog();
-            }
-            Block::Iwdg => self.follow_watchdog(),
-            // It may have been written outside its window.
-            Block::Wwdg => self.slice.leave = true,
-            Block::Crc if self.costs => self.clock.cycles += CRC_WORD,
-            Block::Flash => {
-                self.slice.leave |= self.flash.caches_data() != caches_data;
-                self.settle_flash();
-            }
-            Block::Gpio(_) => {
-                self.wire_pins();
-                self.attend_bus();
-                self.show_pins();
-            }
-            Block::Syscfg | Block::Pwr => self.show_pins(),
-            Block::Can1 | Block::Can2 => {
-                if block == Block::Can1 {
-                    self.tell_slave();
-                }
-                self.attend_bus();
-            }
-            _ => {}
-        }
-        result
-    }
-
-    /// The levels that EXTI lines 0 to 16 follow: pins, and the voltage detector.
-    fn exti_levels(&self) -> u32 {
-        (0..16).fold(u32::from(self.pwr.supply_is_low()) << 16, |levels, line| {
-            let port = self.gpio.get(self.syscfg.port_of(line));
-            levels | u32::from(port.is_some_and(|port| port.level(line))) << line
-        })
-    }
-
-    /// Updates the levels at the EXTI lines, which may have changed.
-    pub fn show_pins(&mut self) {
-        if self.exti.listens() {
-            let levels = self.exti_levels();
-            self.exti.show(levels);
-        }
-    }
-
-    /// Call it after anything that may have started, ended or waited for a flash operation.
-    fn settle_flash(&mut self) {
-        if let Some(until) = self.flash.take_wait() {
-            self.slice.hold_until = Some(until);
-            self.slice.leave = true;
-        }
-        let busy = self.flash.busy_until().is_some();
-        if busy && !self.slice.guarded {
-            self.slice.flush_tlb = true;
-            self.slice.leave = true;
-        }
-        self.slice.guarded = busy;
-        if self.flash.power_has_failed() {
-            self.slice.leave = true;
-        }
-        self.take_flash_changes();
-    }
-
-    fn store_scs(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
-        if self.scs.systick.advance(now) {
-            self.scs.exceptions.pend(SYS_TICK);
-        }
-        match self.scs.write(offset, value, now)? {
-            Effect::None => {}
-            Effect::FpuAccess | Effect::Stepping | Effect::Traps => self.slice.leave = true,
-            Effect::SystemReset => {
-                self.slice.reset_request = Some(ResetCause::Software);
-                self.slice.leave = true;
-            }
-        }
-        Ok(())
-    }
-
-    /// A write may have raised an interrupt line, or have started or ended something. An event that
-    /// has come due within the block that writes is not processed yet: the CPU leaves for it.
-    fn after_write(&mut self) {
-        self.update_lines();
-        let now = self.now();
-        let next = self.next_event();
-        self.slice.leave |= next.is_some_and(|event| event <= now);
-        self.end_slice_at(next);
-    }
-
-    /// The reset bits of the modelled blocks: each sits 20h before the enable bit.
-    fn reset_bits(&self) -> [bool; BLOCKS.len()] {
-        BLOCKS.map(|(_, _, enable)| {
-            enable.is_some_and(|(register, bit)| self.rcc.plain(register - 0x20) & 1 << bit != 0)
-        })
-    }
-
-    fn reset_blocks(&mut self, before: [bool; BLOCKS.len()]) {
-        let after = self.reset_bits();
-        for (index, (_, block, _)) in BLOCKS.into_iter().enumerate() {
-            // Ports that the chip does not have have no reset bit either.
-            if after[index] && !before[index] {
-                self.block_mut(block).reset();
-                self.tell_slave();
-                self.wire_pins();
-            }
-        }
-    }
-
-    /// The CPU is about to run a straight run of code.
-    pub fn fetch(&mut self, address: u32, size: u32) {
-        if !self.flash.caches_code() {
-            return;
-        }
-        let flash = self.geometry.flash;
-        let behind = self.behind_alias(address).unwrap_or(address);
-        if !flash.contains(behind, 1) {
-            return;
-        }
-        let Some(old) = self.flash.fetch(behind - flash.base, size) else { return };
-        let what = "the instruction cache has this line from before it was erased or programmed, and was not flushed \
-                    (FLASH_ACR.ICRST while ICEN is clear): the chip may run the old code";
-        self.report(Access::Fetch, flash.base + old, 16, 0, address, what.into());
-    }
-
-    /// The CPU is about to load from the flash array.
-    pub fn load_flash(&mut self, address: u32, size: u32) {
-        let address = self.behind_alias(address).unwrap_or(address);
-        self.flash.load(address.wrapping_sub(self.geometry.flash.base) % self.geometry.flash.size, size);
-        self.take_flash_changes();
-    }
-
-    /// The CPU stores into the flash array.
-    pub fn store_flash(&mut self, address: u32, bytes: &[u8], pc: u32) {
-        let now = self.now();
-        let offset = address.wrapping_sub(self.geometry.flash.base) % self.geometry.flash.size;
-        let erased_needed = {
-            let array = &self.flash.array.bytes()[offset as usize..];
-            array.iter().zip(bytes).any(|(old, new)| new & !old != 0)
-        };
-        let size = u8::try_from(bytes.len()).unwrap_or(u8::MAX);
-        let mut word = [0; 4];
-        for (to, from) in word.iter_mut().zip(bytes) {
-            *to = *from;
-        }
-        let value = u32::from_le_bytes(word);
-        match self.flash.store(offset, bytes, now) {
-            Store::Started if erased_needed => {
-                let what = "programs a 1 over a 0: the bit stays 0".into();
-                self.report(Access::Write, address, size, value, pc, what);
-            }
-            Store::Started => {
-                if let Some(what) = self.flash.weakness() {
-                    self.report(Access::Write, address, size, value, pc, what);
-                }
-            }
-            Store::Refused(why) => {
-                self.report(Access::Write, address, size, value, pc, format!("flash not programmed: {why}"));
-            }
-        }
-        self.settle_flash();
-        self.after_write();
-    }
-}
-
-/// Whether a register belongs to a counter that counts the core's cycles: SysTick, or the cycle counter of
-/// the DWT.
-#[must_use]
-pub fn counts_cycles(address: u32) -> bool {
-    Region::new(SCS + 0x10, 0x10).contains(address, 1) || Region::new(DWT, 8).contains(address, 1)
-}
-
-/// The byte-in-word address and bit that a bit-band alias offset stands for.
-fn bit_band(base: u32, alias_offset: u32) -> (u32, u32) {
-    let byte = alias_offset / 32;
-    let bit = alias_offset / 4 % 8;
-    (base + (byte & !3), bit + 8 * (byte & 3))
-}
-
-fn mask(size: u8) -> u32 {
-    match size {
-        1 => 0xFF,
-        2 => 0xFFFF,
-        _ => u32::MAX,
     }
 }

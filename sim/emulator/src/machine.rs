@@ -8,8 +8,9 @@ use std::collections::BTreeSet;
 use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bxcan::BxCan;
+use crate::chip::memory_map::OTP;
+use crate::chip::Chip;
 pub use crate::chip::Counters;
-use crate::chip::{Chip, OTP};
 use crate::cpu::{Cpu, Entry, Exit};
 pub use crate::error::Error;
 use crate::noise::Noise;
@@ -756,11 +757,6 @@ impl Machine {
     #[must_use]
     pub fn reports(&self) -> &[Report] {
         self.cpu.chip().reports.as_slice()
-    }
-
-    /// Forgets the reports.
-    pub fn clear_reports(&mut self) {
-        self.cpu.chip_mut().reports.clear();
     }
 
     /// Records from now on which RAM the code in this region accesses.

@@ -67,8 +67,6 @@ const MOST: usize = 1_000;
 #[derive(Clone, Debug, Default)]
 pub struct Reports {
     list: Vec<Report>,
-    /// Distinct reports beyond the limit.
-    pub dropped: u64,
 }
 
 impl Reports {
@@ -78,7 +76,7 @@ impl Reports {
         match self.list.iter().position(same) {
             Some(known) => self.list[known].count += 1,
             None if self.list.len() < MOST => self.list.push(report),
-            None => self.dropped += 1,
+            None => {}
         }
     }
 
@@ -86,11 +84,5 @@ impl Reports {
     #[must_use]
     pub fn as_slice(&self) -> &[Report] {
         &self.list
-    }
-
-    /// Forgets them.
-    pub fn clear(&mut self) {
-        self.list.clear();
-        self.dropped = 0;
     }
 }

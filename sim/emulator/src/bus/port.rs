@@ -90,12 +90,6 @@ impl HostPort {
         self.received.pop_front()
     }
 
-    /// When the oldest frame in the receive queue came.
-    #[must_use]
-    pub fn received_at(&self) -> Option<Time> {
-        self.received.front().map(|(at, _)| *at)
-    }
-
     /// The oldest frame sent that has not been asked for: when it had gone out, its ticket, and
     /// itself.
     pub fn sent(&mut self) -> Option<(Time, u64, Frame)> {

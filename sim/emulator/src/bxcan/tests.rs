@@ -2,6 +2,7 @@
 //! of a driver, with the bus played by hand. Offsets and bits are the manual's numbers.
 
 use super::*;
+use crate::frame::{Id, StandardId};
 
 const MCR: u32 = 0x00;
 const MSR: u32 = 0x04;

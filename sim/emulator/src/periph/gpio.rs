@@ -25,7 +25,6 @@ pub struct Gpio {
     outside: Outside,
 }
 
-const INPUT: u32 = 0;
 const OUTPUT: u32 = 1;
 const ALTERNATE: u32 = 2;
 
@@ -98,12 +97,6 @@ impl Gpio {
             return self.outside.level & bit != 0;
         }
         Self::field(self.pupdr, pin) == 1
-    }
-
-    /// Whether the program made `pin` an input (the state after reset for most).
-    #[must_use]
-    pub fn is_input(&self, pin: u8) -> bool {
-        Self::field(self.moder, pin) == INPUT
     }
 
     /// The alternate function that the program has given `pin`, if it has (section 8.4.9).

@@ -129,12 +129,6 @@ impl Pwr {
         }
         listens
     }
-
-    /// CR.DBP: whether the backup domain may be written.
-    #[must_use]
-    pub fn backup_writable(&self) -> bool {
-        self.cr & CR_DBP != 0
-    }
 }
 
 impl Peripheral for Pwr {

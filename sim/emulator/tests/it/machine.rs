@@ -2,6 +2,8 @@
 //! results come from the architecture and the reference manuals.
 
 mod can_pins;
+mod debug;
+mod flash;
 mod option_bytes;
 mod programs;
 mod supply;
@@ -9,6 +11,7 @@ mod supply;
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::{Span, Time};
+use flash::UNLOCK;
 use programs::Program;
 use shared_abi::geometry::{Region, STM32F407VG};
 
@@ -283,40 +286,25 @@ fn assert_no_delay(stores: &[(u32, u32)], condition: Condition, cycles: u32) {
     assert_eq!(machine.reports(), []);
 }
 
-/// PM0214 section 4.5: a period of the reload value and one.
 #[test]
-fn systick_is_not_late_because_the_program_writes_registers() {
-    let stores = [(0xE000_E014, 999), (0xE000_E018, 0), (0xE000_E010, 7)];
-    assert_no_delay(&stores, NO_CONDITION, 1_000);
-}
-
-/// Datasheet: 16 µs for a word.
-#[test]
-fn the_flash_is_not_late_because_the_program_writes_registers() {
-    // NVIC line 4, the keys, FLASH_CR: PG, x32, EOPIE.
+fn no_event_is_late_because_the_program_writes_registers() {
+    const CAN1_MCR: u32 = 0x4000_6400;
+    const USART2_SR: u32 = 0x4000_4400;
+    const TC: u32 = 1 << 6;
+    // PM0214 section 4.5: SysTick has a period of the reload value and one.
+    assert_no_delay(&[(0xE000_E014, 999), (0xE000_E018, 0), (0xE000_E010, 7)], NO_CONDITION, 1_000);
+    // Datasheet: 16 µs for a word. NVIC line 4, the keys, FLASH_CR: PG, x32, EOPIE.
     let prepare = [(0xE000_E100, 1 << 4), UNLOCK[0], UNLOCK[1], (0x4002_3C10, 1 | 2 << 8 | 1 << 24)];
     let stores = [&prepare[..], &[(0x0800_4000, 0x1234_5678)]].concat();
     assert_no_delay(&stores, NO_CONDITION, 256);
-}
-
-/// RM0090 section 32.4: from sleep mode to normal mode after 11 recessive bits; with the reset
-/// value of CAN_BTR a bit has 8 quanta of a cycle.
-#[test]
-fn can_is_not_late_because_the_program_writes_registers() {
-    const CAN1_MCR: u32 = 0x4000_6400;
+    // RM0090 section 32.4: from sleep mode to normal mode after 11 recessive bits; with the reset
+    // value of CAN_BTR a bit has 8 quanta of a cycle.
     let not_asleep = (CAN1_MCR + 4, 1 << 1, 0);
     assert_no_delay(&[(0x4002_3840, 1 << 25), (CAN1_MCR, 0)], not_asleep, 88);
-}
-
-/// RM0090 section 30.3.2: TE sends an idle frame first, as long as the character after it: 10 bits
-/// each, at 1 Mbit/s.
-#[test]
-fn a_usart_is_not_late_because_the_program_writes_registers() {
-    const USART2_SR: u32 = 0x4000_4400;
-    const TC: u32 = 1 << 6;
-    // Port A beside D; PA2 is TX (AF7).
+    // RM0090 section 30.3.2: TE sends an idle frame first, as long as the character after it: 10 bits
+    // each, at 1 Mbit/s. Port A beside D; PA2 is TX (AF7). USART2_CR1: UE, TE. TC is set after a
+    // reset, and cleared by writing 0.
     let pin = [(0x4002_3830, 1 << 3 | 1), (0x4002_0020, 7 << 8), (0x4002_0000, 0xA800_0020)];
-    // USART2_CR1: UE, TE. TC is set after a reset, and cleared by writing 0.
     let set_up = [(0x4002_3840, 1 << 17), (USART2_SR + 8, 16), (USART2_SR + 12, 0x2008)];
     let stores = [&pin[..], &set_up, &[(USART2_SR + 4, 0x55), (USART2_SR, 0)]].concat();
     assert_no_delay(&stores, (USART2_SR, TC, TC), 320);
@@ -687,333 +675,6 @@ fn systick_begins_with_what_the_chip_has() {
     }
 }
 
-// --- flash
-// -----------------------------------------------------------------------------------------------------------
-
-const SECTOR_1: usize = 0x4000;
-
-/// Datasheet: 250 ms for 16 KiB at x32. Polling from flash sees BSY set never more than once: the
-/// CPU is stalled.
-#[test]
-fn code_in_flash_stands_still_while_the_flash_is_busy() {
-    let mut machine = with_options(&programs::FLASH_FROM_FLASH, Options::default());
-    machine.load_bin(0x0800_4000, &[0; 64]).unwrap();
-    machine.run_until(ms(260));
-    assert_eq!(machine.flash()[SECTOR_1..SECTOR_1 + 5], [0x78, 0x56, 0x34, 0x12, 0xFF]);
-    let counters = machine.counters();
-    assert_eq!((counters.sectors_erased, counters.units_programmed), (1, 1));
-    assert!((1..=2).contains(&word(&machine, OUT)), "polls: {}", word(&machine, OUT));
-    assert_eq!(word(&machine, OUT + 8), 0, "no error");
-    // During the stall one tick becomes pending; the other 249 are lost.
-    assert!((1..=11).contains(&word(&machine, OUT + 4)), "ticks: {}", word(&machine, OUT + 4));
-    let stalled = counters.flash_stall_time.0;
-    assert!((250 * MS..251 * MS).contains(&stalled), "{stalled}");
-    assert!(counters.flash_stalls >= 2);
-}
-
-#[test]
-fn the_longest_times_can_be_chosen() {
-    let options = Options { flash_times: FlashTimes::Worst, ..Options::default() };
-    let mut machine = with_options(&programs::FLASH_FROM_FLASH, options);
-    machine.run_until(ms(499));
-    assert_eq!(machine.counters().sectors_erased, 0);
-    machine.run_until(ms(501));
-    assert_eq!(machine.counters().sectors_erased, 1);
-}
-
-/// 250 ms at 16 MHz are 4 million cycles; a round of the poll takes four.
-#[test]
-fn code_in_ram_goes_on_and_new_code_in_flash_is_seen() {
-    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
-    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap(); // movs r0, #1; bx lr
-    machine.run_until(ms(300));
-    let log = words(&machine, 3);
-    assert!((990_000..1_010_000).contains(&log[0]), "polls: {}", log[0]);
-    assert_eq!(log[1..], [1, 2], "the old function, then the new one");
-    assert_eq!(machine.counters().flash_stalls, 0);
-}
-
-#[test]
-fn a_load_from_busy_flash_stalls_code_in_ram() {
-    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 1, Options::default());
-    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
-    machine.run_until(ms(300));
-    let log = words(&machine, 3);
-    assert_eq!(log, [1, 1, 2], "BSY was clear at the first poll");
-    assert_eq!(machine.counters().flash_stalls, 1);
-}
-
-/// RM0090 section 3.6.4, programming and caches: a store writes through the data cache, an erase does not reach
-/// it, and DCRST empties it. With the cache off, or on a chip that drops such lines, the array is read.
-#[test]
-fn a_load_by_the_data_cache_is_stale_after_an_erase_until_the_flush() {
-    const OLD: u32 = 0x0BAD_F00D;
-    const NEW: u32 = 0x1234_5678;
-    const BLANK: u32 = u32::MAX;
-    let run = |stale_lines, acr| {
-        let silicon = Silicon { stale_lines, ..TYPICAL };
-        let options = Options { silicon, ..Options::default() };
-        let mut machine = machine_in_ram(&programs::LOADS_BY_THE_CACHE, acr, options);
-        machine.load_bin(0x0800_4000, &OLD.to_le_bytes().repeat(8)).unwrap();
-        machine.run_until(ms(300));
-        assert_eq!(machine.flash()[SECTOR_1 + 4..SECTOR_1 + 8], [0xFF; 4]);
-        words(&machine, 7)
-    };
-    let true_words = [OLD, BLANK, NEW, BLANK, BLANK, BLANK, BLANK];
-    // DCEN; ICEN and PRFTEN.
-    assert_eq!(run(true, 1 << 10), [OLD, OLD, NEW, OLD, BLANK, OLD, BLANK]);
-    assert_eq!(run(true, 1 << 9 | 1 << 8), true_words);
-    assert_eq!(run(false, 1 << 10), true_words);
-}
-
-/// RM0090 section 3.6.4, programming and caches: code that ran from flash and is erased and programmed anew stays in
-/// the instruction cache until ICRST. A fetch of it is reported on a chip that keeps such lines.
-#[test]
-fn a_fetch_of_code_that_was_erased_after_it_ran_is_reported_until_the_flush() {
-    // ICEN; DCEN and PRFTEN.
-    const ICEN: u32 = 1 << 9;
-    const OTHERS: u32 = 1 << 10 | 1 << 8;
-    let run = |stale_lines, acr, flushes| {
-        let silicon = Silicon { stale_lines, ..TYPICAL };
-        let options = Options { silicon, ..Options::default() };
-        let mut machine = machine_in_ram(&programs::RUNS_BY_THE_CACHE, acr, options);
-        put(&mut machine, ARGUMENT + 4, flushes);
-        // movs r0, #1; bx lr
-        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
-        machine.run_until(ms(300));
-        assert_eq!(words(&machine, 2), [1, 2], "the emulator runs the new code");
-        machine.reports().to_vec()
-    };
-    let [report] = &run(true, ICEN, 0)[..] else { panic!("one report") };
-    assert_eq!((report.access, report.address, report.pc), (Access::Fetch, 0x0800_4000, 0x0800_4000));
-    assert!(report.what.contains("ICRST"), "{}", report.what);
-    assert_eq!(run(true, ICEN, 1), []);
-    assert_eq!(run(true, OTHERS, 0), []);
-    assert_eq!(run(false, ICEN, 0), []);
-}
-
-#[test]
-fn the_power_can_be_cut_at_a_flash_operation() {
-    for (when, erased) in [(Cut::Before, false), (Cut::After, true)] {
-        let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
-        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
-        machine.cut_power_at(Some(FlashCut { operation: 0, when }));
-        assert_eq!(machine.run_until(ms(300)), Stop::PowerCut);
-        assert!(!machine.is_powered());
-        assert_eq!(machine.flash()[SECTOR_1] == 0xFF, erased);
-    }
-    let torn = |seed| {
-        let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
-        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47].repeat(100)).unwrap();
-        machine.cut_power_at(Some(FlashCut { operation: 1, when: Cut::Torn { seed } }));
-        assert_eq!(machine.run_until(ms(300)), Stop::PowerCut);
-        machine.flash()[SECTOR_1..SECTOR_1 + 8].to_vec()
-    };
-    let first = torn(1);
-    assert_eq!(first, torn(1));
-    assert_ne!(first, torn(2));
-    assert_eq!(first[4..], [0xFF; 4], "the second operation programs one word");
-    let whole = [0x02, 0x20, 0x70, 0x47];
-    assert!(first.iter().zip(whole).all(|(found, wanted)| found & wanted == wanted), "bits only go to 0");
-}
-
-#[test]
-fn losing_the_power_tears_the_operation_that_runs() {
-    let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 0, Options::default());
-    machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47].repeat(1000)).unwrap();
-    let before = machine.flash().to_vec();
-    machine.run_until(ms(100));
-    machine.power_off();
-    let sector = &machine.flash()[SECTOR_1..SECTOR_1 + 4000];
-    assert!(sector != &before[SECTOR_1..SECTOR_1 + 4000] && sector.iter().any(|&byte| byte != 0xFF));
-    assert!(machine.flash()[..SECTOR_1] == before[..SECTOR_1], "its neighbour is whole");
-}
-
-/// With table and handlers in RAM the ticks go on during the erase; with the table in flash the
-/// first one waits for the vector. 250 ms hold 249 ticks and the end of the erase may come just
-/// before or after the next.
-#[test]
-fn interrupts_during_an_erase_need_their_vectors_in_ram() {
-    let run = |table: u32| {
-        let mut machine = machine_in_ram(&programs::ERASE_UNDER_INTERRUPTS, table, Options::default());
-        // Vectors of the listing: tick at 048h, done at 050h.
-        machine.load_bin(0x0800_0000 + 4 * 15, &0x2000_1049_u32.to_le_bytes()).unwrap();
-        machine.load_bin(0x0800_0000 + 4 * 20, &0x2000_1051_u32.to_le_bytes()).unwrap();
-        machine.run_until(ms(255));
-        (words(&machine, 3), machine.counters())
-    };
-    let (log, counters) = run(0x2000_0400);
-    assert!((249..=250).contains(&log[1]), "ticks: {}", log[1]);
-    assert_eq!(log[2], 1, "EOP");
-    assert_eq!(counters.exceptions[16 + 4], 1);
-    assert_eq!(counters.flash_stalls, 0);
-    let (log, counters) = run(0x0800_0000);
-    assert!(log[1] <= 1, "ticks: {}", log[1]);
-    assert_eq!(log[2], 1);
-    assert!(counters.flash_stalls >= 1);
-}
-
-/// RM0090 section 3.6.1: a bus error.
-#[test]
-fn a_wrong_key_is_a_fault() {
-    let mut machine = machine(&programs::WRONG_KEY);
-    machine.run_until(ms(1));
-    assert_eq!(word(&machine, OUT), 3);
-    assert_eq!(machine.fault_status(), (0x0000_0400, FORCED), "IMPRECISERR");
-    assert!(machine.reports()[0].what.contains("FLASH_KEYR"));
-}
-
-const KEYR: u32 = 0x4002_3C04;
-const OPTKEYR: u32 = 0x4002_3C08;
-const UNLOCK: [(u32, u32); 2] = [(KEYR, 0x4567_0123), (KEYR, 0xCDEF_89AB)];
-const UNLOCK_OPTIONS: [(u32, u32); 2] = [(OPTKEYR, 0x0819_2A3B), (OPTKEYR, 0x4C5D_6E7F)];
-/// Wrong keys for both.
-const LOCK: [(u32, u32); 2] = [(KEYR, 0), (OPTKEYR, 0)];
-const LOCKED: [u32; 2] = [0x8000_0000, 0x0FFF_AAED];
-const OPEN: [u32; 2] = [0, 0x0FFF_AAEC];
-const CPSID_F: (u32, u32) = (1, 1);
-const CPSIE_F: (u32, u32) = (1, 0);
-/// ACTLR.DISDEFWBUF.
-const NO_WRITE_BUFFER: (u32, u32) = (0xE000_E008, 1 << 1);
-/// CCR.BFHFNMIGN, beside STKALIGN.
-const IGNORE_BUS_FAULTS: (u32, u32) = (0xE000_ED14, 1 << 8 | 1 << 9);
-/// SHCSR.BUSFAULTENA.
-const ENABLE_BUS_FAULT: (u32, u32) = (0xE000_ED24, 1 << 17);
-
-/// The result of a script of stores.
-#[derive(Debug, PartialEq, Eq)]
-struct Stored {
-    faults: u32,
-    /// FLASH_CR, FLASH_OPTCR.
-    locks: [u32; 2],
-    cfsr: u32,
-    hfsr: u32,
-    bfar: u32,
-}
-
-/// Runs a script of stores on a machine that has come out of a reset.
-fn store(machine: &mut Machine, script: &[&[(u32, u32)]]) -> Stored {
-    let script = script.concat();
-    for (n, (address, value)) in (0..).zip(script.iter().chain(&[(0, 0)])) {
-        put(machine, ARGUMENT + 8 * n, *address);
-        put(machine, ARGUMENT + 8 * n + 4, *value);
-    }
-    let until = Time(machine.now().0 + MS);
-    assert_eq!(machine.run_until(until), Stop::Deadline);
-    let log = words(machine, 6);
-    Stored { faults: log[0], locks: [log[1], log[2]], cfsr: log[3], hfsr: log[4], bfar: log[5] }
-}
-
-#[test]
-fn the_right_keys_open_flash_and_option_bytes() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let stored = store(&mut machine, &[&UNLOCK, &UNLOCK_OPTIONS]);
-    assert_eq!(stored, Stored { faults: 0, locks: OPEN, cfsr: 0, hfsr: 0, bfar: 0 });
-    assert_eq!(machine.reports(), []);
-}
-
-/// RM0090 sections 3.6.1 and 3.7.2: after a wrong key each key, right or wrong, is a bus error.
-#[test]
-fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let stored = store(&mut machine, &[&LOCK, &UNLOCK, &UNLOCK_OPTIONS]);
-    assert_eq!(stored, Stored { faults: 6, locks: LOCKED, cfsr: 0x400, hfsr: FORCED, bfar: 0 });
-    assert_eq!(word(&machine, OUT + 24), 3, "HardFault");
-    machine.reset_pin();
-    let stored = store(&mut machine, &[&UNLOCK, &UNLOCK_OPTIONS]);
-    assert_eq!((stored.faults, stored.locks), (0, OPEN));
-}
-
-/// A wrong key for one register does not affect the other one.
-#[test]
-fn each_key_register_has_a_lock_of_its_own() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let stored = store(&mut machine, &[&LOCK[..1], &UNLOCK_OPTIONS]);
-    assert_eq!((stored.faults, stored.locks), (1, [LOCKED[0], OPEN[1]]));
-    machine.reset_pin();
-    let stored = store(&mut machine, &[&LOCK[1..], &UNLOCK]);
-    assert_eq!((stored.faults, stored.locks), (1, [OPEN[0], LOCKED[1]]));
-}
-
-#[test]
-fn a_bus_error_is_a_bus_fault_where_that_is_enabled() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let stored = store(&mut machine, &[&[ENABLE_BUS_FAULT], &LOCK]);
-    assert_eq!(stored, Stored { faults: 2, locks: LOCKED, cfsr: 0x400, hfsr: 0, bfar: 0 });
-    assert_eq!(word(&machine, OUT + 24), 5, "BusFault");
-}
-
-/// PM0214 section 4.4.10, IMPRECISERR: the fault becomes pending, and active only when the priority
-/// lets it.
-#[test]
-fn an_imprecise_fault_waits_for_faultmask_to_end() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    for ignore in [&[][..], &[IGNORE_BUS_FAULTS]] {
-        let stored = store(&mut machine, &[ignore, &[CPSID_F], &LOCK]);
-        assert_eq!((stored.faults, stored.locks, stored.cfsr), (0, LOCKED, 0x400));
-        machine.reset_pin();
-        let stored = store(&mut machine, &[ignore, &[CPSID_F], &LOCK, &[CPSIE_F]]);
-        assert_eq!((stored.faults, stored.locks, stored.hfsr), (1, LOCKED, FORCED));
-        machine.reset_pin();
-    }
-}
-
-/// ACTLR.DISDEFWBUF makes bus faults of stores precise (PM0214 section 4.4.1).
-#[test]
-fn without_the_write_buffer_the_fault_names_its_store() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let stored = store(&mut machine, &[&[NO_WRITE_BUFFER], &LOCK[..1]]);
-    assert_eq!(stored.faults, 1);
-    assert_eq!((stored.cfsr, stored.hfsr, stored.bfar), (0x8200, FORCED, KEYR));
-    assert_eq!(word(&machine, OUT + 28), 0x0800_0216, "str r0, [r1]");
-    assert_eq!(stored.locks, [LOCKED[0], 0x0FFF_AAED]);
-}
-
-/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on after the store. The status
-/// registers show the fault.
-#[test]
-fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    let quiet = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS, CPSID_F];
-    let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F]]);
-    assert_eq!(stored, Stored { faults: 0, locks: LOCKED, cfsr: 0x8200, hfsr: 0, bfar: OPTKEYR });
-    assert_eq!(machine.reports(), [], "the program asked to have it ignored");
-    machine.reset_pin();
-    let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F], &UNLOCK]);
-    assert_eq!((stored.faults, stored.locks), (2, LOCKED), "each key that is written later is a fault");
-    machine.reset_pin();
-    let without_mask = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS];
-    let stored = store(&mut machine, &[&without_mask, &LOCK]);
-    assert_eq!(stored.faults, 2, "the bit is for priorities below 0 alone");
-}
-
-#[test]
-fn a_precise_fault_under_faultmask_locks_up_otherwise() {
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    for (n, (address, value)) in (0..).zip([NO_WRITE_BUFFER, CPSID_F, LOCK[0], (0, 0)]) {
-        put(&mut machine, ARGUMENT + 8 * n, address);
-        put(&mut machine, ARGUMENT + 8 * n + 4, value);
-    }
-    assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
-}
-
-/// RM0090 section 3.7.2: programmed option bytes are loaded at the next reset; these protect
-/// sectors 0 and 1.
-#[test]
-fn a_program_protects_sectors_by_its_option_bytes() {
-    const OPTCR: u32 = 0x4002_3C14;
-    let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    store(&mut machine, &[&UNLOCK_OPTIONS, &[(OPTCR, 0x0FFC_AAEC), (OPTCR, 0x0FFC_AAEE)]]);
-    machine.run_until(ms(1_000));
-    machine.power_off();
-    machine.power_on(ms(2_000));
-    let stored = store(&mut machine, &[]);
-    assert_eq!(stored.locks[1], 0x0FFC_AAED);
-    let mut bytes = [0; 4];
-    machine.read_memory(0x1FFF_C008, &mut bytes).unwrap();
-    assert_eq!(bytes, [0xFC, 0x0F, 0x03, 0xF0], "nWRP and its complement");
-}
-
 // --- clocks
 // ----------------------------------------------------------------------------------------------------------
 
@@ -1225,85 +886,8 @@ fn noise_as_a_program_does_no_harm() {
     }
 }
 
-// --- debugging
-// -------------------------------------------------------------------------------------------------------
-
-/// Runs [`programs::BREAKPOINTS`]; returns the pairs of its log and its three results.
-fn debugged(machine: &mut Machine, arguments: [u32; 4], events: u32) -> (Vec<[u32; 2]>, Vec<u32>) {
-    for (n, argument) in (0..).zip(arguments) {
-        put(machine, ARGUMENT + 4 * n, argument);
-    }
-    for n in 0..3 {
-        put(machine, OUT + 4 * n, 0);
-    }
-    for n in 0..16 {
-        put(machine, 0x2000_0200 + 4 * n, 0);
-    }
-    machine.run_until(machine.now() + emulator::time::Span::from_millis(1));
-    let log = |n| [word(machine, 0x2000_0200 + 8 * n), word(machine, 0x2000_0204 + 8 * n)];
-    let log = (0..=events).map(log).collect();
-    (log, words(machine, 3))
-}
-
-/// DDI 0403E section C1: the breakpoint comes before its instruction, which is carried out
-/// afterwards; each step is one instruction, a branch among them; DFSR says 2 for a breakpoint and
-/// 1 for a step.
-#[test]
-fn the_monitor_stops_at_breakpoints_and_steps() {
-    for (comparator, first) in
-        [(0x4800_022D, 0x0800_022C), (0x8800_022D, 0x0800_022E), (0xC800_022D, 0x0800_022C)]
-    {
-        let mut machine = machine(&programs::BREAKPOINTS);
-        let (log, results) = debugged(&mut machine, [0x0101_0000, comparator, 0, 0], 2);
-        assert_eq!(log, [[first, 2], [0x0800_0238, 2], [0, 0]], "{comparator:08X}");
-        assert_eq!(results, [1, 17, 17]);
-        assert_eq!(machine.reports(), []);
-    }
-    let mut machine = machine(&programs::BREAKPOINTS);
-    let (log, results) = debugged(&mut machine, [0x0101_0000, 0x4800_022D, 0, 3], 5);
-    let steps =
-        [[0x0800_022C, 2], [0x0800_022E, 1], [0x0800_0232, 1], [0x0800_0234, 1], [0x0800_0238, 2], [0, 0]];
-    assert_eq!(log, steps);
-    assert_eq!(results, [1, 17, 17]);
-    // The breakpoint, three steps, BKPT: exception 12, each of them.
-    assert_eq!(machine.counters().exceptions[12], 5);
-}
-
-/// HFSR.DEBUGEVT is bit 31.
-#[test]
-fn a_breakpoint_that_the_monitor_cannot_take_is_a_hard_fault() {
-    for (what, demcr, primask) in [("the monitor is off", 0x0100_0000, 0), ("PRIMASK is set", 0x0101_0000, 1)]
-    {
-        let mut machine = machine(&programs::BREAKPOINTS);
-        let (log, results) = debugged(&mut machine, [demcr, 0x4800_022D, primask, 0], 1);
-        assert_eq!(log, [[0x0800_022C, 0x8000_0000], [2, 0]], "{what}");
-        assert_eq!(results, [0, 0, 0], "{what}");
-        // Without a breakpoint in the unit, the program goes on to its BKPT.
-        machine.power_off();
-        machine.power_on(machine.now());
-        let (log, results) = debugged(&mut machine, [demcr, 0, primask, 0], 1);
-        assert_eq!(log, [[0x0800_0238, 0x8000_0000], [2, 0]], "{what}");
-        assert_eq!(results, [1, 17, 0], "{what}");
-    }
-}
-
-/// Breakpoints are in the debug power domain, which a reset leaves alone; the monitor's bits are in
-/// the core.
-#[test]
-fn breakpoints_outlive_a_reset_and_not_the_power() {
-    let mut machine = machine(&programs::BREAKPOINTS);
-    // The monitor's handler turns the unit off at the breakpoint. With PRIMASK set it does not run,
-    // and the unit stays on.
-    debugged(&mut machine, [0x0101_0000, 0x4800_022D, 1, 0], 1);
-    machine.reset_pin();
-    let (log, _) = debugged(&mut machine, [0x0101_0000, 0, 0, 0], 2);
-    assert_eq!(log, [[0x0800_022C, 2], [0x0800_0238, 2], [0, 0]]);
-    debugged(&mut machine, [0, 0x4800_022D, 0, 0], 1);
-    machine.power_off();
-    machine.power_on(machine.now());
-    let (log, _) = debugged(&mut machine, [0x0101_0000, 0, 0, 0], 1);
-    assert_eq!(log, [[0x0800_0238, 2], [0, 0]]);
-}
+// --- resets by the chip itself
+// -----------------------------------------------------------------------------------------------
 
 /// RM0090 sections 7.1.1 and 7.3.21: with nRST_STDBY or nRST_STOP clear, the entry is a reset with
 /// LPWRRSTF, and the pin's flag as with every internal reset.

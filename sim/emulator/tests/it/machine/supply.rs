@@ -1,6 +1,7 @@
 //! VDD: the resets by it, and what does not work with too little of it. Thresholds from the datasheet
 //! (DocID022152, "Embedded reset and power control block characteristics"), typical.
 
+use super::flash::store;
 use super::*;
 
 /// A machine that counts its resets in RAM at [`OUT`] and keeps RCC_CSR at [`OUT`] + 16, after its first
