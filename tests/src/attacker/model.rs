@@ -8,8 +8,8 @@ use canopen::lss::LssAddress;
 use canopen::Frame;
 use embedded_can::Frame as _;
 
-pub const ANSWERS: &str = "the device answers in time, and what was asked alone";
-pub const PARAMETERS: &str = "node parameters are those that a master stored";
+pub(super) const ANSWERS: &str = "the device answers in time, and what was asked alone";
+pub(super) const PARAMETERS: &str = "node parameters are those that a master stored";
 
 /// The start of a change of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
