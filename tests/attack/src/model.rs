@@ -198,8 +198,8 @@ impl Model {
     fn go_on(&mut self, bytes: Option<usize>) -> Result<(), AbortCode> {
         let Some((sub, mut rest)) = self.open.take() else { return Ok(()) };
         let part: Vec<u8> = rest.drain(..bytes.unwrap_or(rest.len()).min(rest.len())).collect();
-        // In pieces of each size that a segment may have.
-        go_on(&mut *self.rig.node, sub, &part, 7 - part.len() % 7)?;
+        // In segments of several sizes. (A first one with fewer than four bytes hides what it is.)
+        go_on(&mut *self.rig.node, sub, &part, 7 - part.len() % 4)?;
         if bytes.is_none() {
             return self.rig.end(sub);
         }

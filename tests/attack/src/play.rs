@@ -109,8 +109,10 @@ impl<D: Device> Attack<'_, D> {
         let setup = self.device.setup();
         let content = Content::Program(sub, Extent::Small);
         let broken = |what: String| Broken("each program can be installed and started afterwards", what);
+        // A sealed device refuses a second CLEAR, and knows of the first one until a reset.
+        let first = if setup.takes_sealed { Action::PowerOff } else { Action::Settle };
         // A host with wrong passwords must wait.
-        self.act_all(&[Action::Settle, Action::Wait(60_000)])?;
+        self.act_all(&[first, Action::Settle, Action::Wait(60_000)])?;
         for action in script::installation(setup, sub, part) {
             let answer = self.act(&action)?;
             self.act_all(&[Action::Settle])?;
