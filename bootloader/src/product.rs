@@ -161,11 +161,11 @@ impl Product {
             ms <= 1000,
             "product: nmt.answer_to_reset_ms must be 1000 or less: until its reset the device is silent"
         );
+        assert!(
+            self.renewal.is_none() || STAGING,
+            "product: renewal needs a layout with staging, where a new bootloader waits: write `renewal: None`"
+        );
         if let Some(Renewal { confirm_within_s: s, .. }) = self.renewal {
-            assert!(
-                STAGING,
-                "product: renewal needs a layout with staging, where a new bootloader waits: write `renewal: None`"
-            );
             assert!(
                 self.watchdog.bootloader_ms.is_some(),
                 "product: renewal needs watchdog.bootloader_ms, which ends the trial of a bootloader that hangs: write \
