@@ -145,7 +145,7 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
 fn a_trial_confirms_itself_when_its_master_has_started_it() {
     let Some(elf) = built() else { return };
     let mut bench = board();
-    flash(&mut bench.session(), &blocks(&elf), &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), blocks(&elf), &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     for confirms in [false, true] {
         bench.session().command(1, ProgramControl::Start).unwrap();
         bench.await_program(1000);
@@ -185,7 +185,7 @@ fn a_program_without_a_label_is_taken_by_every_device() {
     let Some(without) = altered("without-label", LABEL, "") else { return };
     assert_eq!(labelled(&without), None);
     let mut bench = board();
-    flash(&mut bench.session(), &blocks(&without), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), blocks(&without), &FlashOptions::default(), &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
 }
 
@@ -196,11 +196,11 @@ fn a_program_with_vtor_at_the_bootloader_is_told_to_be_silent_and_is_replaced() 
     let (Some(good), Some(wrong)) = (built(), altered("wrong-vtor", FIRST, WRONG_VTOR)) else { return };
     let mut bench = board();
     let error =
-        flash(&mut bench.session(), &blocks(&wrong), &FlashOptions::default(), &mut |_| {}).unwrap_err();
+        flash(&mut bench.session(), blocks(&wrong), &FlashOptions::default(), &mut |_| {}).unwrap_err();
     assert!(error.to_string().contains("the program is not released for autostart"), "{error}");
     bench.run_ms(3000);
     power_cycle(&mut bench);
     assert!(bench.is_bootloader(NODE), "it was not released: {error}");
-    flash(&mut bench.session(), &blocks(&good), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), blocks(&good), &FlashOptions::default(), &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
 }

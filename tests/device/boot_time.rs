@@ -132,7 +132,7 @@ fn the_bootloader_does_not_wait_for_what_systick_held() {
 fn running_board(options: ChipOptions) -> Bench {
     let mut bench = Bench::with(options).switched_on();
     let options = FlashOptions::default().trial_run(false);
-    flash(&mut bench.session(), &large_program(), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), large_program(), &options, &mut |_| {}).unwrap();
     bench.confirm_program();
     bench
 }

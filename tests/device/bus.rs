@@ -44,7 +44,7 @@ fn running(bench: &mut Bench, node: u8) -> Option<&'static str> {
 
 fn install(session: &mut Session<'_>, image: &str) {
     let options = FlashOptions::default().trial_run(false);
-    let report = flash(session, &firmware::blocks(image), &options, &mut |event| {
+    let report = flash(session, firmware::blocks(image), &options, &mut |event| {
         assert!(!matches!(event, Event::Retry(_)), "{event}");
     });
     report.unwrap();

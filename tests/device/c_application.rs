@@ -71,7 +71,7 @@ const PAGE: u32 = 4096;
 
 fn install(bench: &mut Bench, image: &str) -> Report {
     let options = FlashOptions::default().verify(true).trial_run(false);
-    flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap()
+    flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).unwrap()
 }
 
 /// A board that runs the application, and the report of its installation.
@@ -544,7 +544,7 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
 fn a_trial_confirms_itself_and_takes_it_back() {
     let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().start(false);
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_C_PROBE), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_C_PROBE), &options, &mut |_| {}).unwrap();
     let start_unsigned = |bench: &mut Bench| {
         for command in [ProgramControl::ClrSignature, ProgramControl::Start] {
             bench.session().command(1, command).unwrap();

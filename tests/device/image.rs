@@ -575,7 +575,7 @@ fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
             assert!(bench.is_bootloader(NODE), "{image} on {resident}");
             // The image erases, programs and stores by the services of the other resident part.
             let options = FlashOptions::default().trial_run(false);
-            flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+            flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
             bench.confirm_program();
             assert!(!bench.is_bootloader(NODE), "{image} on {resident}");
             bench.session().command(1, ProgramControl::StartBootloader).unwrap();
@@ -614,7 +614,7 @@ fn an_image_takes_longer_tables_than_it_knows() {
         bench.await_boot_up(100);
         assert!(bench.is_bootloader(NODE), "{what}");
         let options = FlashOptions::default();
-        flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
+        flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
             .unwrap_or_else(|error| panic!("{what}: {error}"));
         assert!(!bench.is_bootloader(NODE), "{what}");
     }

@@ -304,7 +304,7 @@ fn board_with(wrong: &Wrong) -> Bench {
     let silicon = Silicon { stale_lines: true, ..TYPICAL };
     let mut bench = Bench::with(machine::Options { silicon, ..machine::Options::default() }).switched_on();
     let options = FlashOptions::default().start(false);
-    flash(&mut bench.session(), &scripted_program(wrong), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), scripted_program(wrong), &options, &mut |_| {}).unwrap();
     bench.run_ms(100);
     bench.events();
     bench

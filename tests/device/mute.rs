@@ -38,7 +38,7 @@ fn board() -> Bench {
 
 fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate) {
     let mut left = None;
-    let error = flash(&mut bench.session(), &mute(), options, &mut |event| {
+    let error = flash(&mut bench.session(), mute(), options, &mut |event| {
         if let Some(state) = event.left() {
             left = Some(state);
         }
@@ -106,7 +106,7 @@ fn a_mute_program_is_not_released_and_the_device_comes_back() {
     let caught = caught(&mut bench, CatchOptions::default());
     assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
     // The next update needs nothing else.
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     assert!(!bench.is_bootloader(NODE));
     bench.assert_nothing_unmodelled();

@@ -165,7 +165,7 @@ fn a_product_without_the_choice_keeps_the_identity_of_the_board() {
         [1, 2, 3, 4].map(|sub| bench.session().read_number(Address::new(0x1018, sub)).unwrap())
     };
     assert_eq!(numbers(&mut bench), of_board());
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
     assert_eq!(numbers(&mut bench), of_board());

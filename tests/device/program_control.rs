@@ -22,7 +22,7 @@ const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 
 fn running_board(image: &str) -> Bench {
     let mut bench = Bench::new().switched_on();
-    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
     bench.run_ms(100);
     bench.events();
     bench
@@ -407,7 +407,7 @@ fn every_other_80h_is_a_call() {
         let mut bench = Bench::new().switched_on();
         let options = FlashOptions::default().watch(Some(Duration::ZERO));
         let began = bench.time();
-        flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).unwrap();
+        flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).unwrap();
         // The erase of a sector of 128 KiB takes a second of it.
         assert!(bench.time() - began < Span::from_millis(4000), "{image}: nobody was asked twice");
         // Released by SYS TEC's command after a download in one transfer.
@@ -500,7 +500,7 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
         // A new download brings everything back.
         flash(
             &mut bench.session(),
-            &firmware::blocks(firmware::APP_V2),
+            firmware::blocks(firmware::APP_V2),
             &FlashOptions::default(),
             &mut |_| {},
         )

@@ -21,7 +21,7 @@ fn board(silicon: Silicon) -> Bench {
 
 fn update(bench: &mut Bench, image: &str) -> bool {
     let options = FlashOptions::default().trial_run(false).watch(Some(Duration::ZERO));
-    flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).is_ok()
+    flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).is_ok()
 }
 
 /// The line is free again: the device, which was never reset, is back in time.

@@ -31,7 +31,7 @@ fn board_with_a_program() -> Bench {
 
 fn update(bench: &mut Bench, image: &str) -> Result<(), Error> {
     let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
-    flash(&mut bench.session(), &firmware::blocks(image), &options, &mut |_| {}).map(drop)
+    flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).map(drop)
 }
 
 fn set_supply(bench: &mut Bench, mv: u32) {

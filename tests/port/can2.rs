@@ -95,7 +95,7 @@ fn an_update_and_the_way_back_through_can2() {
     assert_set_up(&mut bench, [0xE0, 0xD0]);
 
     let options = FlashOptions::default().trial_run(false);
-    let report = flash(&mut bench.session(), &blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    let report = flash(&mut bench.session(), blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "1.0.0");
     assert!(!bench.is_bootloader(1));
     let identification = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
@@ -113,7 +113,7 @@ fn an_update_and_the_way_back_through_can2() {
     assert_eq!(version(&mut bench), "1.0.0");
 
     // The next version, from the running application; it starts by itself.
-    flash(&mut bench.session(), &blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "2.0.0");
     bench.power_off();
     bench.run_ms(500);

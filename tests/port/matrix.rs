@@ -225,7 +225,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
         program_of(firmware, &Options::default().region(region).checksum(checksum)).unwrap().program
     };
     let options = FlashOptions::default().start(false).repeats(0).verify(true);
-    let refused = flash(&mut bench.session(), &file(Checksum::Crc32), &options, &mut |_| {});
+    let refused = flash(&mut bench.session(), file(Checksum::Crc32), &options, &mut |_| {});
     assert!(refused.is_err());
     assert_eq!(bench.session().status(1).unwrap().to_word() & 0xFFFF, 0x06);
 

@@ -467,7 +467,7 @@ impl Bench {
     /// If the board does not take it.
     pub fn install(&mut self, image: &str) {
         let options = FlashOptions::default().trial_run(false);
-        let installed = flash(&mut self.session(), &firmware::blocks(image), &options, &mut |_| {});
+        let installed = flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {});
         installed.expect("it is installed");
     }
 

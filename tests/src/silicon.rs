@@ -70,13 +70,13 @@ fn power_cycle(bench: &mut Bench) {
 /// Download, start, way back, download again.
 fn main_job(bench: &mut Bench, way: u8) {
     let options = FlashOptions::default();
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_TEST), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_TEST), &options, &mut |_| {}).unwrap();
     bench.session().write(REENTRY_PATH, &[way], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
     bench.events();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(NODE));
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
     // A request for the bootloader, a start: no crash, and no watchdog that bites a program that lives.
     power_cycle(bench);
@@ -185,7 +185,7 @@ fn update_with_a_cut(bench: &mut Bench, random: &mut Random) {
     bench.confirm_program();
     cut_somewhere(bench, random, UPDATE_OPERATIONS);
     let options = FlashOptions::default().trial_run(false);
-    let _ = flash(&mut bench.session(), &firmware::blocks(firmware::APP_V2), &options, &mut |_| {});
+    let _ = flash(&mut bench.session(), firmware::blocks(firmware::APP_V2), &options, &mut |_| {});
     bench.events();
     power_returns(bench);
     bench.await_program(1000);

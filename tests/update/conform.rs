@@ -288,7 +288,7 @@ fn a_device_in_the_middle_of_a_renewal_is_left_alone() {
 #[test]
 fn an_application_passes_and_keeps_its_state() {
     let mut bench = Bench::new().switched_on();
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     bench.post(0x000, &[0x01, NODE]);
     bench.run_ms(1100);

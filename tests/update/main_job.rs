@@ -24,7 +24,7 @@ fn the_main_job() {
     let mut events = Vec::new();
     let report = flash(
         &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
+        firmware::blocks(firmware::APP_V1),
         &FlashOptions::default(),
         &mut |event| {
             events.push(event);

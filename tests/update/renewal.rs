@@ -28,7 +28,7 @@ fn board() -> Bench {
 }
 
 fn install(bench: &mut Bench, program: &str) {
-    flash(&mut bench.session(), &firmware::blocks(program), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut bench.session(), firmware::blocks(program), &FlashOptions::default(), &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
 }
 

@@ -334,7 +334,8 @@ impl Flash {
     /// The devices of a job file. Every image is read and checked before any device is changed.
     fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
         // Devices with the same image share it.
-        let mut known: Vec<(PathBuf, Option<String>, u8, Option<Dialect>, Payload)> = Vec::new();
+        type Known = (PathBuf, Option<String>, u8, Option<Dialect>, Payload);
+        let mut known: Vec<Known> = Vec::new();
         let mut devices = Vec::new();
         let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
         let wrong = |fault| Failure::recipe(job, &fault);

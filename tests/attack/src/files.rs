@@ -152,8 +152,9 @@ pub struct File {
 
 /// The file with this content for a device.
 pub fn file(setup: &'static Setup, content: Content) -> Rc<File> {
+    type Key = (&'static str, bool, Content);
     thread_local! {
-        static FILES: RefCell<HashMap<(&'static str, bool, Content), Rc<File>>> = RefCell::default();
+        static FILES: RefCell<HashMap<Key, Rc<File>>> = RefCell::default();
     }
     let make = || Rc::new(make(setup, content));
     if matches!(content, Content::Free(_)) {
@@ -285,7 +286,7 @@ impl Sent {
     /// Whether it completes a program, if it is accepted.
     pub(crate) fn completes(self, setup: &'static Setup, sub: u8) -> bool {
         let blocks = file(setup, self.content).blocks.len();
-        let is_last = |n: usize| (n + 1) % blocks == 0 && self.flaw != Flaw::Sum;
+        let is_last = |n: usize| (n + 1).is_multiple_of(blocks) && self.flaw != Flaw::Sum;
         !matches!(self.part, Part::Block(n) if !is_last(n)) || setup.is_data(sub)
     }
 
@@ -343,7 +344,7 @@ fn make(setup: &Setup, content: Content) -> File {
         Content::Release(number, row) => {
             let region = setup.region(number);
             let size = RELEASES[usize::from(row)].0;
-            (number, region.base, 96, program(region, PRODUCT_CODE, size, 16 * number | row))
+            (number, region.base, 96, program(region, PRODUCT_CODE, size, (16 * number) | row))
         }
         Content::Free(which) => {
             let bytes = FREE.with_borrow(|all| all[which].clone());

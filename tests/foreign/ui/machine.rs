@@ -178,7 +178,7 @@ fn a_sealed_device_programs_in_c_and_in_rust_are_updated_by_command_line_page_an
     // The agent, after two nodes have got other programs in between.
     for (node, old) in [(IN_C[0], OLD.panel), (DRIVES[1], OLD.drive)] {
         let mut session = machine.endpoint.bench.session_with(node);
-        flash(&mut session, &firmware::blocks(old), &FlashOptions::default(), &mut |_| {}).unwrap();
+        flash(&mut session, firmware::blocks(old), &FlashOptions::default(), &mut |_| {}).unwrap();
     }
     let server = Server::start(&["press-4"]);
     let package = std::fs::read(machine.folder.join("new.cpk")).unwrap();

@@ -51,7 +51,7 @@ fn run_at(
 ) -> (Result<Report, Error>, Vec<Event>, u8) {
     let mut session = Session::new(adapter, node(at), Timing::default());
     let mut events = Vec::new();
-    let result = flash(&mut session, &file(), options, &mut |event| {
+    let result = flash(&mut session, file(), options, &mut |event| {
         if !matches!(event, Event::Progress { .. }) {
             events.push(event);
         }

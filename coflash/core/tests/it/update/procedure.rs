@@ -34,7 +34,7 @@ fn node() -> NodeId {
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
     let mut events = Vec::new();
     let mut session = Session::new(fake, node(), Timing::default());
-    let result = flash(&mut session, &file(), &options, &mut |event| events.push(event));
+    let result = flash(&mut session, file(), &options, &mut |event| events.push(event));
     (result, events)
 }
 
@@ -179,7 +179,7 @@ fn no_block_is_tried_where_segments_are_asked_for() {
     fake.knows_blocks = Blocks::Known(127);
     let mut session = Session::new(&mut fake, node(), Timing::default());
     session.transfer_by(Transfers::Segments);
-    flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut session, file(), &FlashOptions::default(), &mut |_| {}).unwrap();
     assert_eq!(fake.block_downloads, 0);
 }
 
@@ -352,7 +352,7 @@ fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
         let sent = |fake: &mut Fake, options: FlashOptions| {
             fake.crc_of_blocks = Some(of);
             let mut session = Session::new(fake, node(), Timing::default());
-            flash(&mut session, &block_file::read(file).unwrap(), &options, &mut |_| {})
+            flash(&mut session, block_file::read(file).unwrap(), &options, &mut |_| {})
         };
         let mut fake = Fake::new(BOOTLOADER);
         let report = sent(&mut fake, FlashOptions::default()).unwrap();
@@ -730,7 +730,7 @@ fn silence_is_told_and_comes_to_an_end_soon() {
         let timing = silent.map_or(Timing::default(), |silent| Timing::default().silent(silent));
         let mut session = Session::new(&mut fake, node(), timing);
         let mut events = Vec::new();
-        let error = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| events.push(event))
+        let error = flash(&mut session, file(), &FlashOptions::default(), &mut |event| events.push(event))
             .unwrap_err();
         assert_eq!(error.to_string(), "node 5 does not answer (erasing the program)");
         // The last check takes a second, and the steps before the erase some milliseconds.
@@ -880,7 +880,7 @@ fn answers_that_come_late_do_not_stand_for_others() {
     fake.latency = Duration::from_millis(700);
     let timing = Timing::default().sdo(Duration::from_secs(2));
     let mut session = Session::new(&mut fake, node(), timing);
-    flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {}).unwrap();
+    flash(&mut session, file(), &FlashOptions::default(), &mut |_| {}).unwrap();
 }
 
 #[test]
@@ -891,7 +891,7 @@ fn cancelling_aborts_the_transfer() {
         let flag = Arc::new(AtomicBool::new(false));
         let mut session = Session::new(&mut fake, node(), Timing::default());
         session.cancel_by(flag.clone());
-        let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| {
+        let result = flash(&mut session, file(), &FlashOptions::default(), &mut |event| {
             if matches!(event, Event::Progress { done, .. } if done > 300) {
                 flag.store(true, Ordering::Relaxed);
             }
@@ -1029,7 +1029,7 @@ proptest! {
         let mut chaos = Chaos { now: Duration::ZERO, frames, next: 0 };
         let timing = Timing::default().command(Duration::from_secs(2));
         let mut session = Session::new(&mut chaos, node(), timing);
-        let result = flash(&mut session, &file(), &FlashOptions::default(), &mut |_| {});
+        let result = flash(&mut session, file(), &FlashOptions::default(), &mut |_| {});
         prop_assert!(result.is_err());
         prop_assert!(chaos.now < Duration::from_secs(600), "{:?}", chaos.now);
         let mut session = Session::new(&mut chaos, node(), timing);
