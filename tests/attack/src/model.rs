@@ -199,7 +199,7 @@ impl Model {
         let Some((sub, mut rest)) = self.open.take() else { return Ok(()) };
         let part: Vec<u8> = rest.drain(..bytes.unwrap_or(rest.len()).min(rest.len())).collect();
         // In segments of several sizes. (A first one with fewer than four bytes hides what it is.)
-        go_on(&mut *self.rig.node, sub, &part, 7 - part.len() % 4)?;
+        go_on(&mut *self.rig.node, sub, &part, 7 - part.len() % 7)?;
         if bytes.is_none() {
             return self.rig.end(sub);
         }

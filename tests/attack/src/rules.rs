@@ -118,7 +118,7 @@ impl History {
                 self.unlocked.insert(sub);
                 if setup.password_clears() {
                     self.named.insert(sub);
-                    self.may_lose(sub, !setup.takes_sealed);
+                    self.may_lose(sub, !setup.takes_sealed || self.may_erase);
                 } else {
                     self.unlocked.extend(1..=u8::MAX);
                 }

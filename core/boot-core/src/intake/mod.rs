@@ -127,11 +127,11 @@ macro_rules! formats {
         }
 
         impl Known {
-            /// `None` if there are too few bytes to decide.
+            /// `None` if there are too few bytes to decide: the first format of the list that may have them counts.
             fn recognise<C: Choices>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
                 let mut more = false;
                 $(match <$format>::recognise(first, judge) {
-                    Recognition::Yes(format) if <$format>::is_taken::<C>() => return Ok(Some(Self::$name(format))),
+                    Recognition::Yes(format) if !more && <$format>::is_taken::<C>() => return Ok(Some(Self::$name(format))),
                     Recognition::More => more = true,
                     Recognition::Yes(_) | Recognition::No => {}
                 })*
