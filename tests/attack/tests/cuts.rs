@@ -23,10 +23,14 @@ fn prove(cuts: Cuts) -> u64 {
         println!("{name}: {} operations, {} points, {:?}", report.operations, report.points, report.outcomes);
         wrong.extend(report.told.iter().map(|(point, what)| format!("{point}: {what}")));
         points += report.points;
-        // An update leaves nothing of the old program, or all of it; or the new one.
+        // An update leaves nothing of the old program, or all of it; or the new one. A sample may miss one.
         if matches!(name, "update" | "raw" | "sealed" | "compressed") {
             let kinds = if matches!(name, "sealed" | "compressed") { 4 } else { 3 };
-            assert_eq!(report.outcomes.len(), kinds, "{report:?}");
+            let met = report.outcomes.len();
+            assert!(
+                met == kinds || matches!(cuts, Cuts::Sample(_)) && (2..kinds).contains(&met),
+                "{report:?}"
+            );
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
