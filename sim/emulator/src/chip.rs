@@ -201,7 +201,7 @@ impl Chip {
 
     /// Programs one-time programmable bytes as a debug probe does: a bit only goes from 1 to 0, and one of a
     /// locked block stays. Returns whether all of these blocks could be programmed. `address` and the bytes
-    /// are in [`OTP`].
+    /// are in `OTP`.
     pub fn program_otp(&mut self, address: u32, bytes: &[u8]) -> bool {
         let otp = &mut self.system.bytes_mut()[(OTP.base - SYSTEM.base) as usize..][..OTP.size as usize];
         let (data, locks) = otp.split_at_mut((OTP_BLOCKS * OTP_BLOCK) as usize);
