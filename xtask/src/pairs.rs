@@ -146,7 +146,7 @@ pub const PRODUCT: Product = Product {{
             (None, inner, 1) => format!("{kind} {{ {inner}..BASE.{path} }}"),
             (None, inner, _) => {
                 format!(
-                    "match BASE.{path} {{ Some(base) => Some({kind} {{ {inner}..base }}), None => None }}"
+                    "match BASE.{path} {{ Some(_base) => Some({kind} {{ {inner}.._base }}), None => None }}"
                 )
             }
         };
