@@ -45,7 +45,7 @@ struct Host<'b> {
 impl Adapter for Host<'_> {
     fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
         if self.stops_at == Some(self.sent) {
-            let source = io::Error::from(io::ErrorKind::NotConnected);
+            let source = io::Error::from(io::ErrorKind::NotConnected).into();
             return Err(AdapterError::Lost { adapter: "the host".into(), source });
         }
         self.sent += 1;

@@ -27,7 +27,7 @@ impl Jitter {
     }
 
     /// The pause after this many failures in a row: doubled with each, half of that to all of it.
-    pub(super) fn after(&mut self, failures: u32, first: Duration, most: Duration) -> Duration {
+    pub(super) fn after(&mut self, failures: u32, (first, most): (Duration, Duration)) -> Duration {
         let doubled = first.saturating_mul(1 << failures.saturating_sub(1).min(20)).min(most);
         doubled.mul_f64(0.5 + self.part() / 2.0)
     }
@@ -42,7 +42,7 @@ mod tests {
         let (first, most) = (Duration::from_secs(4), Duration::from_secs(60));
         let course = |seed| {
             let mut jitter = Jitter::new(seed);
-            (1..=40).map(|failures| jitter.after(failures, first, most)).collect::<Vec<_>>()
+            (1..=40).map(|failures| jitter.after(failures, (first, most))).collect::<Vec<_>>()
         };
         for (failures, pause) in course(1).into_iter().enumerate() {
             let full = Duration::from_secs(4 << failures.min(10)).min(most);

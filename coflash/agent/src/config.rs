@@ -115,17 +115,13 @@ pub struct Fault(String);
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 struct File {
     url: Option<String>,
-    #[serde(default = "default_tenant")]
-    tenant: String,
+    tenant: Option<String>,
     ca_file: Option<PathBuf>,
-    #[serde(default = "default_state")]
-    state: PathBuf,
+    state: Option<PathBuf>,
     #[serde(default)]
     plain_http: bool,
-    #[serde(default = "default_least")]
-    poll_least: u64,
-    #[serde(default = "default_most")]
-    poll_most: u64,
+    poll_least: Option<u64>,
+    poll_most: Option<u64>,
     gateway_token_file: Option<PathBuf>,
     gateway_token_env: Option<String>,
     bus: Option<String>,
@@ -166,38 +162,11 @@ struct OneMachine {
 struct OneDevice {
     node: u8,
     board: Option<String>,
-    #[serde(default = "default_program")]
-    program: u8,
-    #[serde(default = "yes")]
-    check_target: bool,
-    #[serde(default = "yes")]
-    trial_run: bool,
+    program: Option<u8>,
+    check_target: Option<bool>,
+    trial_run: Option<bool>,
     #[serde(default)]
     verify: bool,
-}
-
-fn default_tenant() -> String {
-    "DEFAULT".to_string()
-}
-
-fn default_state() -> PathBuf {
-    PathBuf::from("agent-state")
-}
-
-const fn default_least() -> u64 {
-    10
-}
-
-const fn default_most() -> u64 {
-    3600
-}
-
-const fn default_program() -> u8 {
-    1
-}
-
-const fn yes() -> bool {
-    true
 }
 
 /// The longest controllerId and tenant that hawkBit knows.
@@ -247,8 +216,10 @@ impl Config {
         if server.is_tls() && !cfg!(feature = "tls") {
             return Err(format!("'{url}' needs TLS, and this coflash was built without the feature tls"));
         }
-        name("tenant", &file.tenant)?;
-        if file.poll_least == 0 || file.poll_least > file.poll_most || file.poll_most > POLL_MOST {
+        let tenant = file.tenant.unwrap_or_else(|| "DEFAULT".to_string());
+        name("tenant", &tenant)?;
+        let (least, most) = (file.poll_least.unwrap_or(10), file.poll_most.unwrap_or(3600));
+        if least == 0 || least > most || most > POLL_MOST {
             return Err(format!("poll-least and poll-most must be 1 to {POLL_MOST} seconds, in this order"));
         }
         let read = |source: Source<'_>| token(&source, folder, variable);
@@ -282,10 +253,10 @@ impl Config {
         }
         Ok(Self {
             server,
-            tenant: file.tenant,
+            tenant,
             ca_file: file.ca_file.map(|path| folder.join(path)),
-            state: folder.join(file.state),
-            poll: (Duration::from_secs(file.poll_least), Duration::from_secs(file.poll_most)),
+            state: folder.join(file.state.unwrap_or_else(|| "agent-state".into())),
+            poll: (Duration::from_secs(least), Duration::from_secs(most)),
             targets,
         })
     }
@@ -357,17 +328,18 @@ impl OneDevice {
         let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
         let board = self.board.as_deref().or(board).map(|word| board::in_folder(word, folder));
         let board = board.map(|word| board::named(&word)).transpose().map_err(|error| error.to_string())?;
-        if !(1..=254).contains(&self.program) {
+        let program = self.program.unwrap_or(1);
+        if !(1..=254).contains(&program) {
             return Err("programs are 1 to 254".to_string());
         }
-        if let Some(board) = board.filter(|board| board.program(self.program).is_none()) {
-            return Err(format!("{} has no program {}", board.board, self.program));
+        if let Some(board) = board.filter(|board| board.program(program).is_none()) {
+            return Err(format!("{} has no program {program}", board.board));
         }
         Ok(Device {
             node,
-            program: self.program,
-            check_target: self.check_target,
-            trial_run: self.trial_run,
+            program,
+            check_target: self.check_target.unwrap_or(true),
+            trial_run: self.trial_run.unwrap_or(true),
             verify: self.verify,
             board,
         })

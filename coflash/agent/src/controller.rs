@@ -743,8 +743,7 @@ impl Controller {
                     let why = format!("{name} cannot be fetched: {why} ({failures} attempts)");
                     return self.end(&action, false, vec![why]);
                 }
-                let (first, most) = self.rules.backoff;
-                let pause = self.jitter.after(failures, first, most);
+                let pause = self.jitter.after(failures, self.rules.backoff);
                 *at = now + pause.max(retry_after.unwrap_or_default().min(RETRY_MOST));
                 self.say(Kind::Trouble, format!("{name}: {why}"));
             }
@@ -754,8 +753,7 @@ impl Controller {
                     let action = task.action.clone();
                     return self.end(&action, false, vec![format!("{name} was not flashed: {why}")]);
                 }
-                let (first, most) = self.rules.backoff;
-                *at = now + self.jitter.after(*wrong, first, most);
+                *at = now + self.jitter.after(*wrong, self.rules.backoff);
                 self.say(Kind::Trouble, format!("{name}: {why}; it is fetched once more"));
             }
         }
@@ -833,8 +831,7 @@ impl Controller {
                 let what = format!("the update waits: {why}");
                 self.tell(&task.action, Execution::Proceeding, std::slice::from_ref(&what));
                 self.say(Kind::Trouble, format!("action {}: {what}", task.action));
-                let (least, most) = self.rules.backoff;
-                let at = now + self.jitter.after(tries, least, most);
+                let at = now + self.jitter.after(tries, self.rules.backoff);
                 self.work = Work::Ready { task, at, fresh: true, told: false, tries };
             }
         }
@@ -887,8 +884,7 @@ impl Controller {
     /// Something went wrong: after a pause, everything is asked anew.
     fn trouble(&mut self, now: Duration, why: String, retry_after: Option<Duration>) {
         self.failures += 1;
-        let (first, most) = self.rules.backoff;
-        let pause = self.jitter.after(self.failures, first, most);
+        let pause = self.jitter.after(self.failures, self.rules.backoff);
         let pause = pause.max(retry_after.unwrap_or_default().min(RETRY_MOST));
         self.hold = now + pause;
         self.poll_at = self.hold;

@@ -7,8 +7,10 @@ use std::io::Read;
 use std::path::Path;
 use std::time::Duration;
 
+use serde_json::Value;
 use ureq::http::{HeaderMap, Response};
-use ureq::{Agent, Body};
+use ureq::typestate::WithBody;
+use ureq::{Agent, Body, RequestBuilder};
 
 use super::config::Token;
 use super::controller::{Reply, Request};
@@ -75,25 +77,19 @@ impl Client {
         request: &Request,
         limits: Limits,
     ) -> Result<Reply, String> {
+        let message = |request: RequestBuilder<WithBody>, body: &Value| {
+            let request = request.header("Authorization", token.header());
+            let request = request.header("Content-Type", "application/json");
+            let limited = request.config().timeout_global(Some(limits.request)).build();
+            limited.send(body.to_string()).map(opened).map_err(words)
+        };
         let mut opened = match request {
-            Request::Get(link) if link.is_empty() => {
-                self.get(root, token, None, true, Some(limits.request))?
+            Request::Get(link) => {
+                let link = if link.is_empty() { root } else { link };
+                self.get(link, token, None, true, Some(limits.request))?
             }
-            Request::Get(link) => self.get(link, token, None, true, Some(limits.request))?,
-            Request::Post(path, body) => {
-                let url = format!("{root}/{path}");
-                let request = self.agent.post(&url).header("Authorization", token.header());
-                let request = request.header("Content-Type", "application/json");
-                let limited = request.config().timeout_global(Some(limits.request)).build();
-                opened(limited.send(body.to_string()).map_err(words)?)
-            }
-            Request::Put(path, body) => {
-                let url = format!("{root}/{path}");
-                let request = self.agent.put(&url).header("Authorization", token.header());
-                let request = request.header("Content-Type", "application/json");
-                let limited = request.config().timeout_global(Some(limits.request)).build();
-                opened(limited.send(body.to_string()).map_err(words)?)
-            }
+            Request::Post(path, body) => message(self.agent.post(format!("{root}/{path}")), body)?,
+            Request::Put(path, body) => message(self.agent.put(format!("{root}/{path}")), body)?,
         };
         if (300..400).contains(&opened.status) {
             return Err("the server redirects a message, which is not followed: check the url".to_string());

@@ -183,7 +183,8 @@ fn record(shared: &Shared<'_>, target: &Target, root: &str, seed: u64) -> Option
             text: why,
             update: None,
         });
-        let until = shared.began.elapsed() + jitter.after(failures, times.backoff_first, times.backoff_most);
+        let until =
+            shared.began.elapsed() + jitter.after(failures, (times.backoff_first, times.backoff_most));
         while !once && shared.began.elapsed() < until && !cancelled.load(Ordering::Relaxed) {
             thread::sleep(TICK.min(until.saturating_sub(shared.began.elapsed())));
         }

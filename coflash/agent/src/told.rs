@@ -1,10 +1,10 @@
 //! What the server hears of an update: its news, and its end.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use canopen::{Frame, NodeId};
-use coboot_can::{Adapter, Link, Tap};
+use coboot_can::{wall, Link, Tap};
 use coflash_core::update::event::Phase;
 use coflash_core::update::many::Failed;
 use coflash_core::update::{DeviceState, Event, Histories};
@@ -21,9 +21,8 @@ impl Shown {
     pub(super) fn on(&self, link: Link) -> Link {
         let Link::Bus(adapter) = link else { return link };
         let histories = self.0.clone();
-        let origin = wall().saturating_sub(adapter.now());
-        let ear = move |now: Duration, frame: &Frame| {
-            histories.lock().unwrap_or_else(PoisonError::into_inner).saw(origin + now, frame);
+        let ear = move |time: Duration, frame: &Frame, _: bool| {
+            histories.lock().unwrap_or_else(PoisonError::into_inner).saw(time, frame);
         };
         Link::Bus(Box::new(Tap::new(adapter, Box::new(ear))))
     }
@@ -35,10 +34,6 @@ impl Shown {
         news.extend(failed.map(News::Failed));
         news
     }
-}
-
-fn wall() -> Duration {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
 
 fn news_of(event: &Event) -> Vec<News> {

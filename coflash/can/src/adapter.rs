@@ -1,6 +1,7 @@
 //! The trait for a CAN bus, and the errors that an adapter can report.
 
 use std::io;
+use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::frame::Channel;
@@ -120,7 +121,7 @@ pub(super) const NO_ADAPTER: &str = "there is no such adapter";
 pub(super) const ABSENT: &str = "plug it in, and check its number";
 
 /// The errors of an adapter.
-#[derive(Debug, thiserror::Error)]
+#[derive(Clone, Debug, thiserror::Error)]
 pub enum AdapterError {
     /// The URL names no adapter.
     #[error("bus '{url}': {why}")]
@@ -136,7 +137,7 @@ pub enum AdapterError {
         /// The adapter's name.
         adapter: String,
         /// The system's error.
-        source: io::Error,
+        source: Arc<io::Error>,
     },
     /// The adapter is missing, denies access or lacks its driver, and the reason is known.
     #[error("{adapter} cannot be opened: {what}")]
@@ -172,7 +173,7 @@ pub enum AdapterError {
         /// The adapter's name.
         adapter: String,
         /// The error that showed it.
-        source: io::Error,
+        source: Arc<io::Error>,
     },
     /// A gateway does not answer, or it refuses a request for a reason of its own.
     #[error("{adapter}: {what}")]

@@ -153,7 +153,8 @@ impl Driven {
                 source: io::Error::new(
                     io::ErrorKind::TimedOut,
                     format!("its driver has not come back for {} s", OPENING.as_secs()),
-                ),
+                )
+                .into(),
             }),
         }
     }
@@ -164,8 +165,8 @@ impl Driven {
         match lock(&self.status).fault.clone() {
             Some(Fault::Nonsense(said)) => AdapterError::Protocol { adapter, said },
             Some(Fault::Stuck(health)) => AdapterError::Stuck { adapter, health },
-            Some(Fault::Lost(how)) => AdapterError::Lost { adapter, source: io::Error::other(how) },
-            None => AdapterError::Lost { adapter, source: io::Error::other("its driver has crashed") },
+            Some(Fault::Lost(how)) => AdapterError::Lost { adapter, source: io::Error::other(how).into() },
+            None => AdapterError::Lost { adapter, source: io::Error::other("its driver has crashed").into() },
         }
     }
 }
@@ -240,7 +241,8 @@ impl Adapter for Driven {
                     thread::sleep(Duration::from_micros(200));
                 }
                 Err(TrySendError::Full(_)) => {
-                    let source = io::Error::new(io::ErrorKind::TimedOut, "its driver does not come back");
+                    let source =
+                        io::Error::new(io::ErrorKind::TimedOut, "its driver does not come back").into();
                     return Err(AdapterError::Lost { adapter: self.name.clone(), source });
                 }
                 Err(TrySendError::Disconnected(_)) => return Err(self.fault()),

@@ -54,8 +54,8 @@ pub use self::slcan::{Line, Slcan};
 #[cfg(target_os = "linux")]
 pub use self::socketcan::SocketCan;
 pub use self::socketcand::Socketcand;
-pub use self::tap::{Ear, Tap};
-pub use self::trace::{OnFailure, Trace};
+pub use self::tap::{wall, Ear, Tap};
+pub use self::trace::{trace, OnFailure};
 
 /// The example on the crate's page compiles and runs.
 #[cfg(doctest)]
@@ -64,7 +64,14 @@ struct Readme;
 
 #[cfg(test)]
 mod tests {
+    use canopen::{CobId, Frame};
+
     use super::*;
+
+    /// A data frame of the tests.
+    pub(super) fn frame(id: u16, data: &[u8]) -> Frame {
+        Frame::of(CobId::new(id).unwrap(), data)
+    }
 
     /// A link can be opened in one thread and used in another. This test only has to compile.
     #[test]
@@ -80,7 +87,6 @@ mod tests {
         moves::<SocketCan>();
         moves::<Cia309>();
         moves::<SdoIds<Box<dyn Adapter + Send>>>();
-        moves::<Trace<Box<dyn Adapter + Send>>>();
         moves::<Tap<Box<dyn Adapter + Send>>>();
         moves::<hub::Port>();
     }

@@ -81,6 +81,7 @@ impl<A: Adapter> Adapter for SdoIds<A> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tests::frame;
 
     /// The frames to receive, and the frames that were sent.
     #[derive(Default)]
@@ -102,10 +103,6 @@ mod tests {
         fn now(&self) -> Duration {
             Duration::ZERO
         }
-    }
-
-    fn frame(id: u16, data: &[u8]) -> Frame {
-        Frame::of(CobId::new(id).unwrap(), data)
     }
 
     #[test]

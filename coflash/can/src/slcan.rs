@@ -14,7 +14,7 @@ use super::echo::Echoes;
 use super::health::{Controller, Health};
 use super::hex::{hex_bytes, hex_number};
 use super::ports;
-use super::tcp::{connect, PATIENCE};
+use super::tcp::{connect, waits, PATIENCE};
 
 mod opening;
 
@@ -95,11 +95,7 @@ impl Slcan<TcpStream> {
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
     pub fn connect(server: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         let name = format!("SLCAN adapter {server}");
-        let open = |source| AdapterError::Open { adapter: name.clone(), source };
-        let stream = connect(server, None).map_err(open)?;
-        stream.set_nodelay(true).map_err(open)?;
-        stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
-        Self::open(stream, name, bit_rate)
+        Self::open(connect(&name, server, None, PATIENCE)?, name, bit_rate)
     }
 }
 
@@ -183,8 +179,7 @@ impl<L: Line> Slcan<L> {
                     return Err(self.lost(closed));
                 }
                 Ok(len) => self.rest.extend_from_slice(&bytes[..len]),
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+                Err(error) if waits(&error) => {}
                 Err(error) => return Err(self.lost(error)),
             }
             if left.is_zero() {
@@ -220,7 +215,7 @@ impl<L: Line> Slcan<L> {
     }
 
     fn lost(&self, source: io::Error) -> AdapterError {
-        AdapterError::Lost { adapter: self.name.clone(), source }
+        AdapterError::Lost { adapter: self.name.clone(), source: source.into() }
     }
 
     fn unexpected(&self, said: String) -> AdapterError {

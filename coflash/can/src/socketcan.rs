@@ -15,6 +15,7 @@ use super::adapter::{Adapter, AdapterError, Obstacle};
 use super::found::shown;
 use super::health::{Controller, Health};
 use super::links;
+use super::tcp::waits;
 
 /// How long the interface may take to accept a frame. Its queue stays full while no node
 /// acknowledges on the bus.
@@ -61,7 +62,7 @@ impl SocketCan {
     }
 
     fn lost(&self, source: io::Error) -> AdapterError {
-        AdapterError::Lost { adapter: self.name.clone(), source }
+        AdapterError::Lost { adapter: self.name.clone(), source: source.into() }
     }
 
     fn stuck(&mut self) -> AdapterError {
@@ -176,11 +177,7 @@ impl Adapter for SocketCan {
                 Ok(CanFrame::Error(frame)) => self.health.error_frame(frame.error_bits(), frame.data()),
                 // Remote frames are ignored.
                 Ok(CanFrame::Remote(_)) => {}
-                Err(error)
-                    if matches!(
-                        error.kind(),
-                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
-                    ) => {}
+                Err(error) if waits(&error) => {}
                 Err(error) => return Err(self.lost(error)),
             }
             if Instant::now() >= deadline {

@@ -14,7 +14,7 @@ use super::echo::Echoes;
 use super::found::shown;
 use super::health::Health;
 use super::hex::{hex_bytes, hex_number};
-use super::tcp::{connect, PATIENCE};
+use super::tcp::{connect, waits, PATIENCE};
 
 /// Longer than any message of the protocol.
 const LONGEST_MESSAGE: usize = 4096;
@@ -48,14 +48,8 @@ impl Socketcand {
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
     pub fn connect(server: &str, bus: &str) -> Result<Self, AdapterError> {
         let name = format!("socketcand {server}, bus {bus}");
-        let open = |source| AdapterError::Open { adapter: name.clone(), source };
-        let stream = connect(server, Some(DEFAULT_PORT)).map_err(open)?;
-        // Frames are small, and the client waits for each answer: Nagle's algorithm would delay
-        // them.
-        stream.set_nodelay(true).map_err(open)?;
-        stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
         let mut adapter = Self {
-            stream,
+            stream: connect(&name, server, Some(DEFAULT_PORT), PATIENCE)?,
             name,
             opened: Instant::now(),
             messages: Messages::default(),
@@ -138,11 +132,7 @@ impl Socketcand {
                     return Err(self.lost(closed));
                 }
                 Ok(len) => self.messages.add(&bytes[..len]),
-                Err(error)
-                    if matches!(
-                        error.kind(),
-                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
-                    ) => {}
+                Err(error) if waits(&error) => {}
                 Err(error) => return Err(self.lost(error)),
             }
             // After the deadline the stream is read once: text between messages may have no end.
@@ -161,7 +151,7 @@ impl Socketcand {
     }
 
     fn lost(&self, source: io::Error) -> AdapterError {
-        AdapterError::Lost { adapter: self.name.clone(), source }
+        AdapterError::Lost { adapter: self.name.clone(), source: source.into() }
     }
 
     fn unexpected(&self, said: String) -> AdapterError {
@@ -344,10 +334,7 @@ mod tests {
 
     use super::*;
     use crate::health::Trouble;
-
-    fn frame(id: u16, data: &[u8]) -> Frame {
-        Frame::of(CobId::new(id).unwrap(), data)
-    }
+    use crate::tests::frame;
 
     /// Both directions, as the protocol description of socketcand writes them.
     #[test]

@@ -1,14 +1,38 @@
 //! TCP connections to servers.
 
-use std::io;
+use std::io::{self, ErrorKind};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::Duration;
+
+use super::adapter::AdapterError;
 
 /// How long a server may take to accept the connection, and to accept data.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
 
+/// Whether the error only means that the socket has no data, or no room, at present.
+pub(crate) fn waits(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
+/// Connects to a server, `name` in messages. A read or a write waits for at most `wait`. Messages are
+/// small, and each is waited for: Nagle's algorithm would delay them.
+pub(crate) fn connect(
+    name: &str,
+    server: &str,
+    default_port: Option<u16>,
+    wait: Duration,
+) -> Result<TcpStream, AdapterError> {
+    let connected = stream(server, default_port).and_then(|stream| {
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(wait))?;
+        stream.set_write_timeout(Some(wait))?;
+        Ok(stream)
+    });
+    connected.map_err(|source| AdapterError::Open { adapter: name.to_string(), source: source.into() })
+}
+
 /// Connects to the first address of the server that answers.
-pub(crate) fn connect(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
+fn stream(server: &str, default_port: Option<u16>) -> io::Result<TcpStream> {
     let has_port = server.rsplit_once(':').is_some_and(|(host, port)| {
         !port.is_empty()
             && port.bytes().all(|b| b.is_ascii_digit())

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use canopen::NodeId;
-use coboot_can::{Adapter, Kind, Link, SdoIds, Trace};
+use coboot_can::{trace, Adapter, Kind, Link, SdoIds};
 use coflash_core::device::lock::Lock;
 
 use super::output::{Failure, Output};
@@ -83,7 +83,7 @@ impl Context {
             Some(path) => {
                 let (out, name) = (self.out, path.display().to_string());
                 let failed = move |error| out.warn(format_args!("{name}: writing failed: {error}"));
-                Box::new(Trace::new(adapter, path, Box::new(failed))?)
+                Box::new(trace(adapter, path, Box::new(failed))?)
             }
             None => adapter,
         };

@@ -8,13 +8,13 @@ use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock, PoisonError};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use canopen::{Frame, NodeId};
 use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
-use coboot_can::{Adapter, Tap};
+use coboot_can::{wall, Adapter, Tap};
 use coflash_core::update::{stamp, Event, Histories};
 use serde_json::{json, Value};
 
@@ -207,13 +207,12 @@ pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send
     if !is_kept() {
         return adapter;
     }
-    let origin = wall().saturating_sub(adapter.now());
     let (mut passwords, mut contents) = (Redactor::default(), Redactor::of_contents());
     let mut decoder = Decoder::new();
-    let ear = move |now: Duration, frame: &Frame| {
+    let ear = move |time: Duration, frame: &Frame, _: bool| {
         let Some(record) = RECORD.get() else { return };
         let words = decoder.decode(&contents.frame(frame));
-        let (time, shown) = (origin + now, passwords.frame(frame));
+        let shown = passwords.frame(frame);
         let text = Line { time, interface: "can0".to_string(), frame: shown }.to_string();
         record.note("frame", &format!("{shown}  {words}"));
         if let Some(report) = &record.report {
@@ -260,8 +259,4 @@ impl Report {
         let text = secrets::without_urls(&format!("{:#}\n", *document));
         fs::write(&path, text).map_err(|error| cannot(&path, &error))
     }
-}
-
-fn wall() -> Duration {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }

@@ -84,6 +84,25 @@ pub(super) fn skipped<T>(why: impl Into<String>) -> Result<T, Stop> {
     Err(Stop::Skipped(why.into()))
 }
 
+/// Goes on if this holds; otherwise the check has failed, and the words say what the device did.
+macro_rules! ensure {
+    ($holds:expr, $($words:tt)+) => {
+        if !$holds {
+            return Err($crate::Stop::Failed(format!($($words)+)));
+        }
+    };
+}
+
+/// Goes on if this holds; otherwise the check is skipped, and the words say why.
+macro_rules! need {
+    ($holds:expr, $($words:tt)+) => {
+        if !$holds {
+            return Err($crate::Stop::Skipped(format!($($words)+)));
+        }
+    };
+}
+pub(super) use {ensure, need};
+
 /// An SDO request of eight bytes for an object.
 pub(super) const fn request(command: u8, index: u16, sub: u8, data: [u8; 4]) -> [u8; 8] {
     let [low, high] = index.to_le_bytes();
@@ -258,11 +277,10 @@ impl<'a> Bench<'a> {
         if answer[0] == 0x80 {
             let right = std::mem::replace(&mut self.at, NONE);
             let [[i, j, sub], [k, l, other]] = [right, [answer[1], answer[2], answer[3]]];
-            if [k, l, other] != right {
-                return failed(format!(
-                    "the abort names {l:02X}{k:02X}h/{other} in place of {j:02X}{i:02X}h/{sub}"
-                ));
-            }
+            ensure!(
+                [k, l, other] == right,
+                "the abort names {l:02X}{k:02X}h/{other} in place of {j:02X}{i:02X}h/{sub}"
+            );
         }
         Ok(answer)
     }
@@ -333,16 +351,13 @@ impl<'a> Bench<'a> {
         if let Some(code) = abort_of(&answer) {
             return failed(format!("{index:04X}h/{sub} is refused: abort {code:08X}h"));
         }
-        if answer[0] != 0x43 | (4 - len) << 2 {
-            return failed(format!(
-                "{index:04X}h/{sub}: command byte {:02X}h in place of {:02X}h",
-                answer[0],
-                0x43 | (4 - len) << 2
-            ));
-        }
-        if answer[1..4] != asked[1..4] {
-            return failed(format!("{index:04X}h/{sub}: the answer is for another object"));
-        }
+        let right = 0x43 | (4 - len) << 2;
+        ensure!(
+            answer[0] == right,
+            "{index:04X}h/{sub}: command byte {:02X}h in place of {right:02X}h",
+            answer[0]
+        );
+        ensure!(answer[1..4] == asked[1..4], "{index:04X}h/{sub}: the answer is for another object");
         Ok(u32::from_le_bytes([answer[4], answer[5], answer[6], answer[7]]) & (u32::MAX >> (8 * (4 - len))))
     }
 }

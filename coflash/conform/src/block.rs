@@ -5,8 +5,8 @@ use std::time::Duration;
 use canopen::CobId;
 use crc::{Crc, CRC_16_XMODEM};
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
-use super::check::Check;
+use super::bench::{abort_of, ensure, failed, need, request, Bench, Stop};
+use super::check::{Check, Step};
 use super::sdo::{text, COMMAND, NO_OBJECT, NO_SUB_INDEX};
 
 const BLOCK_SIZE: u32 = 0x0504_0002;
@@ -28,12 +28,7 @@ const fn initiate(command: u8, sub: u8, index: u16, block_size: u8, threshold: u
     request(command, index, sub, [block_size, threshold, 0, 0])
 }
 
-const fn check(
-    id: &'static str,
-    title: &'static str,
-    clause: &'static str,
-    run: fn(&mut Bench<'_>) -> Result<(), Stop>,
-) -> Check {
+const fn check(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Check {
     Check::new(id, title, clause, run).needs(has_block_upload)
 }
 
@@ -55,25 +50,17 @@ pub(super) const CHECKS: &[Check] = &[
         let first = sub_block(b, 127)?;
         // The sub-block is lost as a whole.
         b.tell(acknowledge(0, 127))?;
-        if sub_block(b, 127)? == first {
-            Ok(())
-        } else {
-            failed("other segments came")
-        }
+        ensure!(sub_block(b, 127)? == first, "other segments came");
+        Ok(())
     }),
     check("BLK-007", "an acknowledgement of a part: the rest comes again, numbered from 1", SUB_BLOCK, |b| {
         start(b, true, 127)?;
         let first = sub_block(b, 127)?;
-        if first.len() < 2 {
-            return skipped("1008h has one segment");
-        }
+        need!(first.len() >= 2, "1008h has one segment");
         b.tell(acknowledge(1, 127))?;
         let rest = sub_block(b, 127)?;
-        if rest[..] == first[1..] {
-            Ok(())
-        } else {
-            failed(format!("{} of {} segments came again", rest.len(), first.len() - 1))
-        }
+        ensure!(rest[..] == first[1..], "{} of {} segments came again", rest.len(), first.len() - 1);
+        Ok(())
     }),
     check("BLK-008", "an acknowledgement of more than was sent: 05040003h", SUB_BLOCK, |b| {
         start(b, true, 127)?;
@@ -128,20 +115,15 @@ fn has_block_upload(b: &mut Bench<'_>) -> Result<(), Stop> {
     if abort_of(&answer).is_none() {
         b.abort(0x1008, 0)?;
     }
-    if answer[0] & 0xE1 == 0xC0 {
-        Ok(())
-    } else {
-        skipped("the device has no block upload of 1008h")
-    }
+    need!(answer[0] & 0xE1 == 0xC0, "the device has no block upload of 1008h");
+    Ok(())
 }
 
 /// Begins a block upload of 1008h and starts it. Returns whether the device sends a CRC.
 fn start(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<bool, Stop> {
     let command = if crc { 0xA4 } else { 0xA0 };
     let answer = b.ask(initiate(command, 0, 0x1008, block_size, 0))?;
-    if answer[0] & 0xF9 != 0xC0 {
-        return failed(format!("command byte {:02X}h to the initiate", answer[0]));
-    }
+    ensure!(answer[0] & 0xF9 == 0xC0, "command byte {:02X}h to the initiate", answer[0]);
     b.tell(START)?;
     Ok(answer[0] & 4 != 0)
 }
@@ -152,9 +134,12 @@ fn sub_block(b: &mut Bench<'_>, block_size: u8) -> Result<Vec<[u8; 7]>, Stop> {
     loop {
         let [number, data @ ..] = b.heard()?;
         segments.push(data);
-        if usize::from(number & 0x7F) != segments.len() {
-            return failed(format!("segment {} has number {}", segments.len(), number & 0x7F));
-        }
+        ensure!(
+            usize::from(number & 0x7F) == segments.len(),
+            "segment {} has number {}",
+            segments.len(),
+            number & 0x7F
+        );
         if number & 0x80 != 0 || segments.len() == usize::from(block_size) {
             break;
         }
@@ -169,9 +154,7 @@ fn sub_block(b: &mut Bench<'_>, block_size: u8) -> Result<Vec<[u8; 7]>, Stop> {
 fn whole(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<(), Stop> {
     let expected = text(b, 0x1008)?;
     let count = expected.len().div_ceil(7);
-    if count > MOST {
-        return skipped("1008h is too long");
-    }
+    need!(count <= MOST, "1008h is too long");
     let sends_crc = start(b, crc, block_size)?;
     let mut got = Vec::new();
     let mut left = count;
@@ -185,19 +168,13 @@ fn whole(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<(), Stop> {
             continue;
         }
         let end = b.ask(last)?;
-        if end[0] & 0xE3 != 0xC1 {
-            return failed(format!("command byte {:02X}h at the end", end[0]));
-        }
+        ensure!(end[0] & 0xE3 == 0xC1, "command byte {:02X}h at the end", end[0]);
         let unused = usize::from(end[0] >> 2 & 7);
         got.truncate(got.len() - unused);
-        if got != expected {
-            return failed(format!("{got:02X?} in place of {expected:02X?}"));
-        }
+        ensure!(got == expected, "{got:02X?} in place of {expected:02X?}");
         let told = u16::from_le_bytes([end[1], end[2]]);
         let right = Crc::<u16>::new(&CRC_16_XMODEM).checksum(&got);
-        if crc && sends_crc && told != right {
-            return failed(format!("CRC {told:04X}h in place of {right:04X}h"));
-        }
+        ensure!(!crc || !sends_crc || told == right, "CRC {told:04X}h in place of {right:04X}h");
     }
     b.tell([0xA1, 0, 0, 0, 0, 0, 0, 0])?;
     b.works()

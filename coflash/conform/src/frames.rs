@@ -6,7 +6,7 @@ use canopen::nmt::NmtCommand;
 use canopen::{CobId, Frame, NodeId};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 
-use super::bench::{failed, request, skipped, Bench, Stop};
+use super::bench::{ensure, request, skipped, Bench, Stop};
 use super::check::Check;
 use coboot_can::AdapterError;
 use coflash_core::device::Error;
@@ -100,9 +100,7 @@ pub(super) fn no_boot_up(b: &mut Bench<'_>, frame: &Frame) -> Result<(), Stop> {
     let id = CobId::heartbeat(b.node);
     let end = b.now() + REACTION;
     while let Some(heard) = b.hear(id, end.saturating_sub(b.now()))? {
-        if heard.data() == [0] {
-            return failed(format!("{frame} led to a boot-up message"));
-        }
+        ensure!(heard.data() != [0], "{frame} led to a boot-up message");
     }
     b.works()
 }

@@ -14,8 +14,8 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::{CobId, Frame, NodeId};
 
-use super::bench::{failed, skipped, Bench, Stop};
-use super::check::Check;
+use super::bench::{failed, need, skipped, Bench, Stop};
+use super::check::{Check, Step};
 use super::frames::extended;
 
 /// How long an LSS answer may take; CiA 305 leaves the limit to the master.
@@ -33,12 +33,7 @@ const CONFIGURE: &str = "CiA 305, LSS configuration";
 const IDENTIFY: &str = "CiA 305, LSS identification";
 
 /// A check of a device that has layer setting services.
-const fn check(
-    id: &'static str,
-    title: &'static str,
-    clause: &'static str,
-    run: fn(&mut Bench<'_>) -> Result<(), Stop>,
-) -> Check {
+const fn check(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Check {
     Check::new(id, title, clause, run).needs(has_lss)
 }
 
@@ -174,9 +169,7 @@ fn silent(b: &mut Bench<'_>, data: &[u8]) -> Result<(), Stop> {
 
 /// The LSS address: 1018h/1 to 4.
 fn identity(b: &mut Bench<'_>) -> Result<[u32; 4], Stop> {
-    if b.value(0x1018, 0, 1)? < 4 {
-        return skipped("1018h has no serial number");
-    }
+    need!(b.value(0x1018, 0, 1)? >= 4, "1018h has no serial number");
     Ok([b.value(0x1018, 1, 4)?, b.value(0x1018, 2, 4)?, b.value(0x1018, 3, 4)?, b.value(0x1018, 4, 4)?])
 }
 

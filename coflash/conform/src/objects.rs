@@ -2,7 +2,7 @@
 
 use canopen::CobId;
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::bench::{abort_of, ensure, failed, request, skipped, Bench, Stop};
 use super::check::{Check, Run};
 use super::sdo::{text, INVALID, NO_DATA, NO_OBJECT, NO_SUB_INDEX, READ_ONLY};
 
@@ -33,11 +33,8 @@ pub(super) const CHECKS: &[Check] = &[
     }),
     Check::new("OD-006", "the same value is read twice from 1018h/1", IDENTITY, |b| {
         let (first, second) = (b.value(0x1018, 1, 4)?, b.value(0x1018, 1, 4)?);
-        if first == second {
-            Ok(())
-        } else {
-            failed(format!("{first:08X}h, then {second:08X}h"))
-        }
+        ensure!(first == second, "{first:08X}h, then {second:08X}h");
+        Ok(())
     }),
     Check::of(
         "OD-007",
@@ -108,9 +105,6 @@ pub(super) fn has(b: &mut Bench<'_>, index: u16, sub: u8) -> Result<(), Stop> {
 fn printable(b: &mut Bench<'_>, index: u16) -> Result<(), Stop> {
     has(b, index, 0)?;
     let text = text(b, index)?;
-    if text.iter().all(|byte| (0x20..0x7F).contains(byte)) {
-        Ok(())
-    } else {
-        failed(format!("{index:04X}h is {text:02X?}"))
-    }
+    ensure!(text.iter().all(|byte| (0x20..0x7F).contains(byte)), "{index:04X}h is {text:02X?}");
+    Ok(())
 }

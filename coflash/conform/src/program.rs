@@ -6,8 +6,8 @@ use std::time::Duration;
 use canopen::CobId;
 use crc::{Crc, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
-use super::check::{Check, Run};
+use super::bench::{abort_of, ensure, failed, need, request, skipped, Bench, Stop};
+use super::check::{Check, Run, Step};
 use super::sdo::{COMMAND, INVALID, NO_OBJECT, NO_SUB_INDEX, READ_ONLY, TOGGLE, WRITE_ONLY};
 
 /// What 1000h reads in a bootloader (L-1112, "Procedure in principle").
@@ -43,12 +43,7 @@ const fn refused(
     Check::of(id, title, clause, Run::Refused(asked, code)).needs(is_bootloader)
 }
 
-const fn check(
-    id: &'static str,
-    title: &'static str,
-    clause: &'static str,
-    run: fn(&mut Bench<'_>) -> Result<(), Stop>,
-) -> Check {
+const fn check(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Check {
     Check::new(id, title, clause, run).needs(is_bootloader)
 }
 
@@ -62,9 +57,7 @@ pub(super) const CHECKS: &[Check] = &[
         let count = b.value(0x1F50, 0, 1)?;
         for index in [0x1F51, 0x1F56, 0x1F57] {
             let other = b.value(index, 0, 1)?;
-            if other != count {
-                return failed(format!("1F50h/0 is {count}, {index:04X}h/0 is {other}"));
-            }
+            ensure!(other == count, "1F50h/0 is {count}, {index:04X}h/0 is {other}");
         }
         Ok(())
     }),
@@ -129,11 +122,8 @@ pub(super) const CHECKS: &[Check] = &[
         b.tell([1, 99, 0, 0, 0, 0, 0, 0])?;
         let answer = b.takes([0x80 | 3, 0, 0, 0, 0, 0, 0, 0], 0xA2)?;
         b.abort(0x1F50, 1)?;
-        if answer[1] == 1 {
-            Ok(())
-        } else {
-            failed(format!("{} is acknowledged", answer[1]))
-        }
+        ensure!(answer[1] == 1, "{} is acknowledged", answer[1]);
+        Ok(())
     }),
     check("PRG-032", "no end of a block download after the client's abort: 05040001h", ABORTS, |b| {
         one_block(b)?;
@@ -191,9 +181,7 @@ pub(super) fn idle(b: &mut Bench<'_>, program: u8) -> Result<u32, Stop> {
 
 /// Skips the checks of this group in a device that is no bootloader by these documents.
 pub(super) fn is_bootloader(b: &mut Bench<'_>) -> Result<(), Stop> {
-    if b.value(0x1000, 0, 4)? != BOOTLOADER {
-        return skipped("1000h is not 10000000h: no bootloader, or its program runs");
-    }
+    need!(b.value(0x1000, 0, 4)? == BOOTLOADER, "1000h is not 10000000h: no bootloader, or its program runs");
     super::objects::has(b, 0x1F57, 0)
 }
 
@@ -273,11 +261,8 @@ fn begin_block(b: &mut Bench<'_>, size: u32) -> Result<(), Stop> {
 fn one_block(b: &mut Bench<'_>) -> Result<(), Stop> {
     begin_block(b, 1)?;
     let answer = b.takes([0x81, UNKNOWN, 0, 0, 0, 0, 0, 0], 0xA2)?;
-    if answer[1] == 1 {
-        Ok(())
-    } else {
-        failed(format!("{} is acknowledged", answer[1]))
-    }
+    ensure!(answer[1] == 1, "{} is acknowledged", answer[1]);
+    Ok(())
 }
 
 /// The end of this download; `wrong` alters the CRC.

@@ -9,7 +9,7 @@ use crc::{Crc, CRC_32_ISO_HDLC};
 use shared_abi::ram_image::{Header, MAGIC, SERVICES_VERSION};
 use shared_abi::renewal::{Origin, Progress, State};
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::bench::{abort_of, ensure, failed, need, request, skipped, Bench, Stop};
 use super::check::{Check, Step};
 use super::program::{download, idle, is_bootloader, BOOTLOADER};
 
@@ -25,9 +25,7 @@ pub(super) const CHECKS: &[Check] = &[
         let number = number(b)?;
         for index in [PROGRAM_DATA, PROGRAM_CONTROL, PROGRAM_ID, FLASH_STATUS] {
             let highest = b.value(index, 0, 1)?;
-            if highest < number.into() {
-                return failed(format!("2007h/1 is {number}, and {index:04X}h/0 is {highest}"));
-            }
+            ensure!(highest >= number.into(), "2007h/1 is {number}, and {index:04X}h/0 is {highest}");
         }
         b.value(PROGRAM_CONTROL, number, 1)?;
         b.value(PROGRAM_ID, number, 4)?;
@@ -69,9 +67,10 @@ fn number(b: &mut Bench<'_>) -> Result<u8, Stop> {
 fn at_rest(b: &mut Bench<'_>) -> Result<(), Stop> {
     is_bootloader(b)?;
     let answer = b.ask(request(0x40, DEVICE_STATE, STATE_BOOTLOADER, [0; 4]))?;
-    if abort_of(&answer).is_some() || number(b)? == 0 {
-        return skipped("2007h/1 is 0 or absent: this bootloader cannot be renewed over the bus");
-    }
+    need!(
+        abort_of(&answer).is_none() && number(b)? != 0,
+        "2007h/1 is 0 or absent: this bootloader cannot be renewed over the bus"
+    );
     match progress(b)? {
         Progress {
             state: State::None | State::Installed, origin: Origin::Home | Origin::Confirmed, ..

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use canopen::{CobId, Frame};
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::bench::{abort_of, ensure, failed, need, request, skipped, Bench, Stop};
 use super::check::{Check, Run};
 
 const UP: u8 = 0x40;
@@ -62,9 +62,7 @@ pub(super) const CHECKS: &[Check] = &[
         for command in [UP, 0x23, 0x21, 0xA4, 0xC6] {
             b.works()?;
             let answer = b.ask(request(command, 0x1018, 0xC8, [127, 0, 0, 0]))?;
-            if abort_of(&answer).is_none() {
-                return failed(format!("{command:02X}h is answered with {:02X}h in place of an abort", answer[0]));
-            }
+            ensure!(abort_of(&answer).is_some(), "{command:02X}h is answered with {:02X}h in place of an abort", answer[0]);
         }
         Ok(())
     }),
@@ -90,9 +88,7 @@ pub(super) const CHECKS: &[Check] = &[
         for (asked, code) in [(up(0x0FFF, 0), NO_OBJECT), (down(0x1000, 0), READ_ONLY), (bare(0x60), COMMAND)] {
             b.refuses(asked, code)?;
             let now = b.value(0x1000, 0, 4)?;
-            if now != kind {
-                return failed(format!("1000h is {now:08X}h after {code:08X}h"));
-            }
+            ensure!(now == kind, "1000h is {now:08X}h after {code:08X}h");
         }
         Ok(())
     }),
@@ -115,9 +111,7 @@ pub(super) const CHECKS: &[Check] = &[
         b.refuses(bare(0x60), COMMAND)
     }),
     Check::new("SEG-005", "the second segment with the first one's toggle bit: 05030000h", SEGMENT, |b| {
-        if begin_segmented(b)? <= 7 {
-            return skipped("1008h has one segment");
-        }
+        need!(begin_segmented(b)? > 7, "1008h has one segment");
         b.takes(bare(0x60), 0x00)?;
         b.refuses(bare(0x60), TOGGLE)
     }),
@@ -134,11 +128,8 @@ pub(super) const CHECKS: &[Check] = &[
     Check::new("SEG-008", "1008h is the same when it is read again", SEGMENT, |b| {
         begin_segmented(b)?;
         b.abort(0x1008, 0)?;
-        if text(b, 0x1008)? == text(b, 0x1008)? {
-            Ok(())
-        } else {
-            failed("1008h has changed")
-        }
+        ensure!(text(b, 0x1008)? == text(b, 0x1008)?, "1008h has changed");
+        Ok(())
     }),
     Check::new("SEG-009", "the server's abort of an abandoned upload is 05040000h", ABORT, |b| {
         begin_segmented(b)?;
@@ -152,9 +143,7 @@ pub(super) const CHECKS: &[Check] = &[
         }
     }),
     Check::new("SEG-010", "a client's abort in mid-transfer ends the upload", ABORT, |b| {
-        if begin_segmented(b)? <= 7 {
-            return skipped("1008h has one segment");
-        }
+        need!(begin_segmented(b)? > 7, "1008h has one segment");
         b.takes(bare(0x60), 0x00)?;
         b.abort(0x1008, 0)?;
         b.refuses(bare(0x70), COMMAND)?;
@@ -191,25 +180,20 @@ pub(super) fn text(b: &mut Bench<'_>, index: u16) -> Result<Vec<u8>, Stop> {
     if answer[0] & 0xE3 == 0x43 {
         return Ok(answer[4..8 - usize::from(answer[0] >> 2 & 3)].to_vec());
     }
-    if answer[0] == 0x40 {
-        return skipped(format!("{index:04X}h comes without a size"));
-    }
-    if answer[0] != 0x41 {
-        return failed(format!("{index:04X}h: command byte {:02X}h", answer[0]));
-    }
+    need!(answer[0] != 0x40, "{index:04X}h comes without a size");
+    ensure!(answer[0] == 0x41, "{index:04X}h: command byte {:02X}h", answer[0]);
     let size = told_size(index, &answer)? as usize;
     let count = size.div_ceil(7);
     let mut got = Vec::new();
     for number in 0..count {
         let toggle = (number as u8 & 1) << 4;
         let answer = b.ask(bare(0x60 | toggle))?;
-        if answer[0] & 0xF0 != toggle {
-            return failed(format!("segment {number}: command byte {:02X}h", answer[0]));
-        }
+        ensure!(answer[0] & 0xF0 == toggle, "segment {number}: command byte {:02X}h", answer[0]);
         got.extend_from_slice(&answer[1..8 - usize::from(answer[0] >> 1 & 7)]);
-        if (answer[0] & 1 == 1) != (number + 1 == count) {
-            return failed(format!("segment {number}: the bit for the last segment is wrong"));
-        }
+        ensure!(
+            (answer[0] & 1 == 1) == (number + 1 == count),
+            "segment {number}: the bit for the last segment is wrong"
+        );
     }
     if got.len() == size {
         Ok(got)

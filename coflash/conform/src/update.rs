@@ -7,8 +7,8 @@ use canopen::nmt::NmtCommand;
 use canopen::program::{FlashError, ProgramControl, PROGRAM_DATA, PROGRAM_ID};
 use canopen::Address;
 
-use super::bench::{failed, request, skipped, Bench, Stop};
-use super::check::Check;
+use super::bench::{ensure, failed, need, request, skipped, Bench, Stop};
+use super::check::{Check, Step};
 use coflash_core::device::{DeviceType, Doing, Error, Session};
 use coflash_core::file::block_file::BlockFile;
 use coflash_core::update::{flash, steps, FlashOptions, Payload};
@@ -56,9 +56,7 @@ pub(super) const CHECKS: &[Check] = &[
         b.with(|session| session.command(NUMBER, ProgramControl::Clear))?;
         let begun = b.now();
         while b.value(0x1F57, NUMBER, 4)? & 1 != 0 {
-            if b.now() > begun + ERASE {
-                return failed(format!("it is still busy after {} s", ERASE.as_secs()));
-            }
+            ensure!(b.now() <= begun + ERASE, "it is still busy after {} s", ERASE.as_secs());
         }
         match b.value(0x1F56, NUMBER, 4)? {
             crc if program.crcs().contains(&crc) => failed("the program is still there"),
@@ -73,16 +71,12 @@ pub(super) const CHECKS: &[Check] = &[
             in_bootloader(b)?;
             b.with(|session| steps::erase_at_once(session, NUMBER))?;
             let crc = b.value(0x1F56, NUMBER, 4)?;
-            if crc != 0 {
-                return failed(format!("1F56h/1 is {crc:08X}h"));
-            }
+            ensure!(crc == 0, "1F56h/1 is {crc:08X}h");
             match b.with(|session| Ok(session.command(NUMBER, ProgramControl::Start)))? {
                 Err(Error::Refused { .. }) => is_bootloader(b),
                 Ok(()) => {
                     let status = b.with(|session| session.await_idle(NUMBER, Doing::Restart))?;
-                    if status.error.is_none() {
-                        return failed("START is acknowledged, and 1F57h tells no error");
-                    }
+                    ensure!(status.error.is_some(), "START is acknowledged, and 1F57h tells no error");
                     is_bootloader(b)
                 }
                 Err(error) => failed(error.to_string()),
@@ -125,9 +119,7 @@ pub(super) const CHECKS: &[Check] = &[
         },
     ),
     check("UPD-010", "the same after a power cut", PROCEDURE, |b| {
-        if !b.has_power() {
-            return skipped("no command for the power is given");
-        }
+        need!(b.has_power(), "no command for the power is given");
         half(b)?;
         b.power(false)?;
         b.with(|session| session.wait(OFF))?;
@@ -142,12 +134,7 @@ pub(super) const CHECKS: &[Check] = &[
     }),
 ];
 
-const fn check(
-    id: &'static str,
-    title: &'static str,
-    clause: &'static str,
-    run: fn(&mut Bench<'_>) -> Result<(), Stop>,
-) -> Check {
+const fn check(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Check {
     Check::new(id, title, clause, run).that_installs()
 }
 

@@ -11,12 +11,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::response::sse::{Event, Sse};
+use coboot_can::wall;
 use futures_util::stream::{self, Stream};
 use serde_json::{json, Value};
 use tokio::sync::watch;
 use tokio::time::sleep;
 
-use super::frames::wall;
 use super::shared::{lock, Shared};
 use super::state::State;
 

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use canopen::{Frame, NodeId};
 use coflash_core::update::{Event, FailedUpdate, Histories};
@@ -13,7 +13,7 @@ use super::load;
 use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
-use coboot_can::{Adapter, AdapterError, Health};
+use coboot_can::{wall, Adapter, Tap};
 
 /// The most frames in words that the page can request.
 const ROWS: usize = 2000;
@@ -129,60 +129,18 @@ fn push<T>(queue: &mut VecDeque<T>, room: usize, item: T) -> bool {
     full
 }
 
-/// The wall clock, since 1970.
-pub(super) fn wall() -> Duration {
-    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
-}
-
 /// An adapter that records its frames, sent and received.
-pub(super) struct Tap {
+pub(super) fn recorded(
     adapter: Box<dyn Adapter + Send>,
     frames: Arc<Mutex<Frames>>,
     arrived: watch::Sender<u64>,
-    /// The wall clock at the adapter's origin of time.
-    origin: Duration,
-}
-
-impl Tap {
-    pub(super) fn new(
-        adapter: Box<dyn Adapter + Send>,
-        frames: Arc<Mutex<Frames>>,
-        arrived: watch::Sender<u64>,
-    ) -> Self {
-        let origin = wall().saturating_sub(adapter.now());
-        Self { adapter, frames, arrived, origin }
-    }
-
-    fn note(&self, frame: &Frame, own: bool) {
-        let time = self.origin + self.adapter.now();
-        let mut frames = self.frames.lock().unwrap_or_else(PoisonError::into_inner);
+) -> Tap<Box<dyn Adapter + Send>> {
+    let ear = move |time: Duration, frame: &Frame, own: bool| {
+        let mut frames = frames.lock().unwrap_or_else(PoisonError::into_inner);
         frames.note(time, frame, own);
-        self.arrived.send_replace(frames.count);
-    }
-}
-
-impl Adapter for Tap {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.adapter.send(frame)?;
-        self.note(frame, true);
-        Ok(())
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        let frame = self.adapter.receive(timeout)?;
-        if let Some(frame) = &frame {
-            self.note(frame, false);
-        }
-        Ok(frame)
-    }
-
-    fn now(&self) -> Duration {
-        self.adapter.now()
-    }
-
-    fn health(&mut self) -> Option<Health> {
-        self.adapter.health()
-    }
+        arrived.send_replace(frames.count);
+    };
+    Tap::new(adapter, Box::new(ear))
 }
 
 #[cfg(test)]

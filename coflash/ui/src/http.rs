@@ -25,7 +25,9 @@ use super::guard::{guard, Guard};
 use super::job::{Job, Step};
 use super::shared::{lock, Order, Refusal, Shared};
 use super::state::{Fits, Notice, Settings};
-use super::upload::{self, Room, Upload};
+use super::upload::{Room, Upload};
+
+pub(super) use super::upload::Refused;
 
 use coboot_can::Kind;
 use coflash_core::device::lss::{BitRate, LssAddress};
@@ -62,9 +64,6 @@ pub(super) struct Page {
     pub(super) routes: Router<Site>,
 }
 
-/// An error in place of the requested answer.
-pub(super) struct Refused(pub(super) StatusCode, pub(super) Notice);
-
 impl IntoResponse for Refused {
     fn into_response(self) -> Response {
         json_response(self.0, &json!(self.1))
@@ -82,27 +81,19 @@ pub(super) fn done() -> Answer {
 }
 
 pub(super) fn bad(words: impl Into<String>, advice: &str) -> Refused {
-    Refused(StatusCode::BAD_REQUEST, Notice::failed(words, advice))
-}
-
-impl From<upload::Refused> for Refused {
-    fn from((status, notice): upload::Refused) -> Self {
-        Self(status, notice)
-    }
+    Refused::new(StatusCode::BAD_REQUEST, words, advice)
 }
 
 impl From<Refusal> for Refused {
     fn from(refusal: Refusal) -> Self {
         match refusal {
-            Refusal::Busy(words) => Self(
+            Refusal::Busy(words) => Self::new(
                 StatusCode::CONFLICT,
-                Notice::failed(
-                    format!("another task is running: {words}"),
-                    "wait until it has finished, or cancel it",
-                ),
+                format!("another task is running: {words}"),
+                "wait until it has finished, or cancel it",
             ),
             Refusal::NotReady(words) => {
-                Self(StatusCode::CONFLICT, Notice::failed(words, "choose an adapter and connect to it first"))
+                Self::new(StatusCode::CONFLICT, words, "choose an adapter and connect to it first")
             }
         }
     }
@@ -141,10 +132,10 @@ pub(super) fn engineers() -> Page {
         .route("/open", post(open))
         .route("/close", post(close))
         .route("/settings", post(settings))
-        .route("/scan", post(scan))
+        .route("/scan", post(|State(site): State<Site>| begin(site, Job::Scan)))
         .route("/update", post(update))
         .route("/step", post(step))
-        .route("/fastscan", post(fastscan))
+        .route("/fastscan", post(|State(site): State<Site>| begin(site, Job::Fastscan)))
         .route("/assign", post(assign));
     Page { files: &FILES, view: Arc::new(|state| json!(state)), routes }
 }
@@ -173,10 +164,8 @@ pub(super) fn router(
 pub(super) fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
     if kind.split(';').next() != Some("application/json") {
-        return Err(Refused(
-            StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            Notice::failed("the request is not JSON", "send it as application/json"),
-        ));
+        let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
+        return Err(Refused::new(status, "the request is not JSON", "send it as application/json"));
     }
     serde_json::from_slice(bytes).map_err(unreadable)
 }
@@ -194,10 +183,10 @@ struct Wanted {
 async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> Answer {
     match events::stream(site.shared, site.view, &site.readers, wanted.frames != 0) {
         Some(stream) => Ok(stream.into_response()),
-        None => Err(Refused(
-            StatusCode::SERVICE_UNAVAILABLE,
-            Notice::failed("too many pages are open", "close some of them"),
-        )),
+        None => {
+            let status = StatusCode::SERVICE_UNAVAILABLE;
+            Err(Refused::new(status, "too many pages are open", "close some of them"))
+        }
     }
 }
 
@@ -234,7 +223,7 @@ async fn readback(State(site): State<Site>) -> Answer {
     let bytes = lock(&site.shared.readback).clone();
     let shown = site.shared.look(|state| state.readback.clone());
     let (Some(bytes), Some(shown)) = (bytes, shown) else {
-        return Err(Refused(StatusCode::NOT_FOUND, Notice::failed("no program was read", "read one first")));
+        return Err(Refused::new(StatusCode::NOT_FOUND, "no program was read", "read one first"));
     };
     let name = format!("node{}-program{}.bin", shown.node, shown.program);
     Ok(download(&name, "application/octet-stream", bytes.to_vec()))
@@ -390,8 +379,9 @@ async fn load(site: &Site, bytes: Arc<Vec<u8>>, name: String, settings: Settings
     }
 }
 
-async fn scan(State(site): State<Site>) -> Answer {
-    site.shared.begin(Job::Scan)?;
+/// Begins a task.
+async fn begin(site: Site, job: Job) -> Answer {
+    site.shared.begin(job)?;
     done()
 }
 
@@ -427,11 +417,11 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
         return Err(bad("there is no firmware file", "drop one on the page, or choose one"));
     };
     if file.shown.is_bootloader && !renew {
-        let notice = Notice::failed(
+        return Err(Refused::new(
+            StatusCode::CONFLICT,
             "the file is a bootloader, and nobody has confirmed that it replaces that of the devices",
             "press the button Update, and confirm the renewal; no device was changed",
-        );
-        return Err(Refused(StatusCode::CONFLICT, notice));
+        ));
     }
     let unlock = password_of(&password)?;
     let mut wanted: Vec<NodeId> = Vec::new();
@@ -454,53 +444,25 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
         (state.settings.program, misfit)
     });
     if let Some(words) = misfit {
-        let notice =
-            Notice::failed(words, "choose the file that is made for this device; no device was changed");
-        return Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice));
+        let advice = "choose the file that is made for this device; no device was changed";
+        return Err(Refused::new(StatusCode::UNPROCESSABLE_ENTITY, words, advice));
     }
-    site.shared.begin(Job::Update { nodes: wanted, file, program, trial, start, unlock })?;
-    done()
+    begin(site, Job::Update { nodes: wanted, file, program, trial, start, unlock }).await
 }
 
 #[derive(Deserialize)]
 struct Single {
     node: u8,
     program: u8,
-    step: Name,
-}
-
-/// The name of a step in a request.
-#[derive(Clone, Copy, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Name {
-    CallBack,
-    Release,
-    Withhold,
-    Erase,
-    Start,
-    ReadBack,
+    step: Step,
 }
 
 async fn step(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
     let Single { node, program, step } = body(&headers, &bytes)?;
-    let step = match step {
-        Name::CallBack => Step::CallBack,
-        Name::Release => Step::Release,
-        Name::Withhold => Step::Withhold,
-        Name::Erase => Step::Erase,
-        Name::Start => Step::Start,
-        Name::ReadBack => Step::ReadBack,
-    };
     if !(1..=254).contains(&program) {
         return Err(bad("programs are 1 to 254", "choose another program"));
     }
-    site.shared.begin(Job::Step { node: node_id(node)?, program, step })?;
-    done()
-}
-
-async fn fastscan(State(site): State<Site>) -> Answer {
-    site.shared.begin(Job::Fastscan)?;
-    done()
+    begin(site, Job::Step { node: node_id(node)?, program, step }).await
 }
 
 #[derive(Deserialize)]
@@ -516,6 +478,7 @@ struct Assign {
 async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
     let Assign { address, node, bit_rate, store } = body(&headers, &bytes)?;
     let [vendor_id, product_code, revision, serial_number] = address;
+    let identity = address.map(Some);
     let address = LssAddress { vendor_id, product_code, revision, serial_number };
     let node = node.map(node_id).transpose()?;
     let rate = |kbits: u32| {
@@ -530,18 +493,13 @@ async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
     if let Some(node) = node {
         let taken = site.shared.look(|state| {
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
-            (device.answers && device.identity != address_of(&address)).then_some(())
+            (device.answers && device.identity != identity).then_some(())
         });
         if taken.is_some() {
             return Err(bad(format!("another device already has node-ID {node}"), "choose a free one"));
         }
     }
-    site.shared.begin(Job::Assign { address, node, bit_rate, store })?;
-    done()
-}
-
-fn address_of(address: &LssAddress) -> [Option<u32>; 4] {
-    [address.vendor_id, address.product_code, address.revision, address.serial_number].map(Some)
+    begin(site, Job::Assign { address, node, bit_rate, store }).await
 }
 
 async fn cancel(State(site): State<Site>) -> Answer {

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use canopen::NodeId;
+use serde::Deserialize;
 
 use super::firmware::Loaded;
 use super::state::{State, Update};
@@ -32,7 +33,8 @@ pub(super) enum Job {
 }
 
 /// A single step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(super) enum Step {
     /// 1F51h = 80h.
     CallBack,

@@ -37,44 +37,29 @@ const LOOK: Duration = Duration::from_millis(100);
 /// How long a cancelled task may take to end.
 const IN_ORDER: Duration = Duration::from_secs(10);
 
-/// The options of the server.
-#[derive(Clone, Debug)]
-#[non_exhaustive]
-pub struct Options {
-    /// The adapter to open at once, as a URL.
-    pub bus: Option<String>,
-    /// The port on 127.0.0.1; 0 for a free one.
-    pub port: u16,
-    /// The base COB-IDs of SDO requests and answers, without the node-ID, if they differ from the
-    /// predefined ones.
-    pub sdo_ids: Option<(u16, u16)>,
-    /// The kinds of adapters that the page offers.
-    pub kinds: Vec<Kind>,
-    /// A page for people who update machines, in place of the one for engineers.
-    pub service: Option<Service>,
-    /// What is done with what a device has shown whose update has failed.
-    pub failed: Failed,
-    /// How long a reader may accept no data before it is dropped.
-    pub write_timeout: Duration,
-    /// How long the header of a request may take to arrive.
-    pub head_timeout: Duration,
-    /// How long an upload may send nothing.
-    pub body_timeout: Duration,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            bus: None,
-            port: 0,
-            sdo_ids: None,
-            kinds: Kind::ALL.to_vec(),
-            service: None,
-            failed: Failed::default(),
-            write_timeout: Duration::from_secs(10),
-            head_timeout: Duration::from_secs(10),
-            body_timeout: Duration::from_secs(10),
-        }
+coflash_core::options! {
+    /// The options of the server.
+    #[derive(Clone, Debug)]
+    pub struct Options {
+        /// The adapter to open at once, as a URL.
+        pub bus: Option<String> = None,
+        /// The port on 127.0.0.1; 0 for a free one.
+        pub port: u16 = 0,
+        /// The base COB-IDs of SDO requests and answers, without the node-ID, if they differ from the
+        /// predefined ones.
+        pub sdo_ids: Option<(u16, u16)> = None,
+        /// The kinds of adapters that the page offers.
+        pub kinds: Vec<Kind> = Kind::ALL.to_vec(),
+        /// A page for people who update machines, in place of the one for engineers.
+        pub service: Option<Service> = None,
+        /// What is done with what a device has shown whose update has failed.
+        pub failed: Failed = Failed::default(),
+        /// How long a reader may accept no data before it is dropped.
+        pub write_timeout: Duration = Duration::from_secs(10),
+        /// How long the header of a request may take to arrive.
+        pub head_timeout: Duration = Duration::from_secs(10),
+        /// How long an upload may send nothing.
+        pub body_timeout: Duration = Duration::from_secs(10),
     }
 }
 

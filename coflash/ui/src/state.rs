@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use canopen::program::ProgramState;
 use canopen::NodeId;
 use serde::{Serialize, Serializer};
+use serde_json::json;
 use shared_abi::layout::Layout;
 
 use super::advice;
@@ -39,7 +40,8 @@ pub(super) struct State {
     /// The number of notices: distinguishes a new notice with the same text.
     pub(super) notices: u64,
     /// The device found by fastscan.
-    pub(super) lss: Option<Lss>,
+    #[serde(serialize_with = "address")]
+    pub(super) lss: Option<LssAddress>,
     pub(super) readback: Option<Readback>,
     pub(super) reports: Vec<Report>,
 }
@@ -80,6 +82,16 @@ pub(super) struct Settings {
 
 fn name<S: Serializer>(board: &Option<&'static Layout>, to: S) -> Result<S::Ok, S::Error> {
     board.map(|board| board.board).serialize(to)
+}
+
+fn address<S: Serializer>(address: &Option<LssAddress>, to: S) -> Result<S::Ok, S::Error> {
+    let parts = |LssAddress { vendor_id, product_code, revision, serial_number }: LssAddress| {
+        json!({
+            "vendor_id": vendor_id, "product_code": product_code, "revision": revision,
+            "serial_number": serial_number,
+        })
+    };
+    address.map(parts).serialize(to)
 }
 
 impl Default for Settings {
@@ -220,15 +232,6 @@ pub(super) struct Notice {
     pub(super) words: String,
     /// What to do next.
     pub(super) advice: Option<String>,
-}
-
-/// A device without a node-ID.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub(super) struct Lss {
-    pub(super) vendor_id: u32,
-    pub(super) product_code: u32,
-    pub(super) revision: u32,
-    pub(super) serial_number: u32,
 }
 
 /// A program that was read from a device.
@@ -479,12 +482,5 @@ impl Notice {
 
     pub(super) fn error(error: &Error) -> Self {
         Self::failed(error.to_string(), advice::on_page(&error.advice()))
-    }
-}
-
-impl From<LssAddress> for Lss {
-    fn from(address: LssAddress) -> Self {
-        let LssAddress { vendor_id, product_code, revision, serial_number } = address;
-        Self { vendor_id, product_code, revision, serial_number }
     }
 }

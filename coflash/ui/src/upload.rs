@@ -31,8 +31,14 @@ pub(super) struct Upload {
     pub(super) room: OwnedSemaphorePermit,
 }
 
-/// Why an upload is refused: the status, and the words for the user.
-pub(super) type Refused = (StatusCode, Notice);
+/// Why a request is refused: the status, and the words for the user.
+pub(super) struct Refused(pub(super) StatusCode, pub(super) Notice);
+
+impl Refused {
+    pub(super) fn new(status: StatusCode, words: impl Into<String>, advice: &str) -> Self {
+        Self(status, Notice::failed(words, advice))
+    }
+}
 
 impl Room {
     pub(super) fn new(silent: Duration) -> Self {
@@ -57,7 +63,7 @@ impl Room {
         // A file has less than 2^32 bytes.
         self.bytes.clone().try_acquire_many_owned(bytes as u32).map_err(|_| {
             let words = "coflash is taking other files, and has no room for one more";
-            refused(StatusCode::SERVICE_UNAVAILABLE, words, "wait a moment, and choose the file again")
+            Refused::new(StatusCode::SERVICE_UNAVAILABLE, words, "wait a moment, and choose the file again")
         })
     }
 
@@ -69,19 +75,20 @@ impl Room {
         loop {
             let part = timeout(self.silent, parts.next())
                 .await
-                .map_err(|_| refused(StatusCode::REQUEST_TIMEOUT, "the file stopped arriving", again))?;
+                .map_err(|_| Refused::new(StatusCode::REQUEST_TIMEOUT, "the file stopped arriving", again))?;
             let Some(part) = part else { return Ok(bytes) };
-            let part = part
-                .map_err(|_| refused(StatusCode::BAD_REQUEST, "the file did not arrive as a whole", again))?;
+            let part = part.map_err(|_| {
+                Refused::new(StatusCode::BAD_REQUEST, "the file did not arrive as a whole", again)
+            })?;
             if part.len() > most - bytes.len() {
                 let words = format!("the file has more than {most} bytes");
-                return Err(refused(StatusCode::PAYLOAD_TOO_LARGE, words, "choose the firmware file itself"));
+                return Err(Refused::new(
+                    StatusCode::PAYLOAD_TOO_LARGE,
+                    words,
+                    "choose the firmware file itself",
+                ));
             }
             bytes.extend_from_slice(&part);
         }
     }
-}
-
-fn refused(status: StatusCode, words: impl Into<String>, advice: &str) -> Refused {
-    (status, Notice::failed(words, advice))
 }

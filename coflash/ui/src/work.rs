@@ -8,11 +8,10 @@ use canopen::{program, Address, NodeId};
 
 use super::advice;
 use super::firmware::Loaded;
-use super::frames::wall;
 use super::job::{Job, Step};
 use super::shared::{lock, Shared, Work};
 use super::state::{Notice, Phase, Readback, Report, State};
-use coboot_can::Link;
+use coboot_can::{wall, Link};
 use coflash_core::device::lss::{self, BitRate, LssAddress, Master};
 use coflash_core::device::{info, scan, Error, ScanOptions, Session, Timing};
 use coflash_core::file::Target;
@@ -270,7 +269,7 @@ fn fastscan(link: &mut Link, shared: &Shared) -> Result<Notice, Error> {
     let back = master.switch_all(false);
     let found = found?;
     back?;
-    shared.change(|state| state.lss = found.map(Into::into));
+    shared.change(|state| state.lss = found);
     Ok(match found {
         Some(address) => Notice::done(format!(
             "found a device without a node-ID, serial number {:08X}h: set one below",

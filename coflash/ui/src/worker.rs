@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::advice;
-use super::frames::Tap;
+use super::frames::recorded;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
 use coboot_can::{bit_rate_of, AdapterError, Link, SdoIds};
@@ -86,7 +86,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Optio
 fn link(shared: &Shared, url: &str, sdo_ids: Option<SdoBases>) -> Result<Link, AdapterError> {
     Ok(match Link::open(url, None)? {
         Link::Bus(adapter) => {
-            let tap = Tap::new(adapter, shared.frames.clone(), shared.arrived.clone());
+            let tap = recorded(adapter, shared.frames.clone(), shared.arrived.clone());
             match sdo_ids {
                 None => Link::Bus(Box::new(tap)),
                 Some((request, response)) => Link::Bus(Box::new(SdoIds::new(tap, request, response))),

@@ -6,9 +6,8 @@
 #![allow(clippy::useless_conversion, clippy::unnecessary_fallible_conversions)]
 
 use std::ffi::{c_int, c_long, c_uint, c_ulong, c_void};
-use std::fmt;
 
-use crate::load::Loaded;
+use crate::load::library;
 use crate::LoadError;
 
 /// The file names of the library, in the order of preference.
@@ -34,46 +33,24 @@ pub struct Message {
     pub data: [u8; 8],
 }
 
-type Nothing = unsafe extern "system" fn();
-type Channels = unsafe extern "system" fn(*mut c_int) -> c_int;
-type ChannelData = unsafe extern "system" fn(c_int, c_int, *mut c_void, usize) -> c_int;
-type Open = unsafe extern "system" fn(c_int, c_int) -> c_int;
-type OfHandle = unsafe extern "system" fn(c_int) -> c_int;
-type BusParameters =
-    unsafe extern "system" fn(c_int, c_long, c_uint, c_uint, c_uint, c_uint, c_uint) -> c_int;
-type Write = unsafe extern "system" fn(c_int, c_long, *mut c_void, c_uint, c_uint) -> c_int;
-type ReadWait = unsafe extern "system" fn(
-    c_int,
-    *mut c_long,
-    *mut c_void,
-    *mut c_uint,
-    *mut c_uint,
-    *mut c_ulong,
-    c_ulong,
-) -> c_int;
-type Status = unsafe extern "system" fn(c_int, *mut c_ulong) -> c_int;
-type Counters = unsafe extern "system" fn(c_int, *mut c_uint, *mut c_uint, *mut c_uint) -> c_int;
-
-/// The library.
-pub struct Canlib {
-    channels: Channels,
-    channel_data: ChannelData,
-    open: Open,
-    close: OfHandle,
-    bus_parameters: BusParameters,
-    bus_on: OfHandle,
-    bus_off: OfHandle,
-    write: Write,
-    read_wait: ReadWait,
-    status: Status,
-    counters: Counters,
-    // The last field, because the functions above belong to it.
-    _library: Loaded,
-}
-
-impl fmt::Debug for Canlib {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Canlib(…)")
+library! {
+    Canlib from FILES,
+    unsafe {
+        initialize: "canInitializeLibrary" = fn();
+        channels: "canGetNumberOfChannels" = fn(*mut c_int) -> c_int;
+        channel_data: "canGetChannelData" = fn(c_int, c_int, *mut c_void, usize) -> c_int;
+        bus_parameters: "canSetBusParams" = fn(c_int, c_long, c_uint, c_uint, c_uint, c_uint, c_uint) -> c_int;
+        write: "canWrite" = fn(c_int, c_long, *mut c_void, c_uint, c_uint) -> c_int;
+        read_wait: "canReadWait" =
+            fn(c_int, *mut c_long, *mut c_void, *mut c_uint, *mut c_uint, *mut c_ulong, c_ulong) -> c_int;
+        status: "canReadStatus" = fn(c_int, *mut c_ulong) -> c_int;
+        counters: "canReadErrorCounters" = fn(c_int, *mut c_uint, *mut c_uint, *mut c_uint) -> c_int;
+    }
+    safe {
+        open: "canOpenChannel" = fn(channel: c_int, flags: c_int) -> c_int;
+        close: "canClose" = fn(handle: c_int) -> c_int;
+        bus_on: "canBusOn" = fn(handle: c_int) -> c_int;
+        bus_off: "canBusOff" = fn(handle: c_int) -> c_int;
     }
 }
 
@@ -83,28 +60,10 @@ impl Canlib {
     /// # Errors
     /// The library is missing or too old.
     pub fn load() -> Result<Self, LoadError> {
-        // SAFETY: the files come from the vendor's installer; the types are those of canlib.h, and
-        // the functions live as long as the library beside them.
-        unsafe {
-            let library = Loaded::first_of(FILES)?;
-            let initialize: Nothing = library.function("canInitializeLibrary")?;
-            let loaded = Self {
-                channels: library.function("canGetNumberOfChannels")?,
-                channel_data: library.function("canGetChannelData")?,
-                open: library.function("canOpenChannel")?,
-                close: library.function("canClose")?,
-                bus_parameters: library.function("canSetBusParams")?,
-                bus_on: library.function("canBusOn")?,
-                bus_off: library.function("canBusOff")?,
-                write: library.function("canWrite")?,
-                read_wait: library.function("canReadWait")?,
-                status: library.function("canReadStatus")?,
-                counters: library.function("canReadErrorCounters")?,
-                _library: library,
-            };
-            initialize();
-            Ok(loaded)
-        }
+        let loaded = Self::find()?;
+        // SAFETY: the function has no arguments.
+        unsafe { (loaded.initialize)() };
+        Ok(loaded)
     }
 
     /// `canGetNumberOfChannels`: returns a `canStatus` and the number.
@@ -123,18 +82,6 @@ impl Canlib {
         (status, text.into_iter().take_while(|byte| *byte != 0).collect())
     }
 
-    /// `canOpenChannel`: returns a handle or a negative `canStatus`.
-    pub fn open(&self, channel: i32, flags: i32) -> i32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.open)(channel, flags) }
-    }
-
-    /// `canClose`.
-    pub fn close(&self, handle: i32) -> i32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.close)(handle) }
-    }
-
     /// `canSetBusParams` with one sample for each bit: a bit rate in bit/s with its segments in
     /// time quanta, or one of the `canBITRATE_…` with zeros.
     pub fn bus_parameters(&self, handle: i32, rate: i32, segments: (u32, u32), jump_width: u32) -> i32 {
@@ -142,18 +89,6 @@ impl Canlib {
         let samples = u32::from(before != 0);
         // SAFETY: the arguments are plain numbers.
         unsafe { (self.bus_parameters)(handle, rate.into(), before, behind, jump_width, samples, 0) }
-    }
-
-    /// `canBusOn`.
-    pub fn bus_on(&self, handle: i32) -> i32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.bus_on)(handle) }
-    }
-
-    /// `canBusOff`.
-    pub fn bus_off(&self, handle: i32) -> i32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.bus_off)(handle) }
     }
 
     /// `canWrite`; `data` has at most 8 bytes. Does not wait.

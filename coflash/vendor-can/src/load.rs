@@ -60,6 +60,55 @@ impl Loaded {
     }
 }
 
+/// A vendor's library: its functions, with their names and types of its header. The safe
+/// ones take and return plain numbers, and become methods.
+macro_rules! library {
+    (
+        $name:ident from $files:expr,
+        unsafe { $($function:ident: $symbol:literal = fn($($argument:ty),*) $(-> $result:ty)?;)* }
+        safe { $($plain:ident: $of:literal = fn($($number:ident: $type:ty),*) -> $status:ty;)* }
+    ) => {
+        /// The library.
+        pub struct $name {
+            $($function: unsafe extern "system" fn($($argument),*) $(-> $result)?,)*
+            $($plain: unsafe extern "system" fn($($type),*) -> $status,)*
+            // The last field, because the functions above belong to it.
+            _library: $crate::load::Loaded,
+        }
+
+        impl std::fmt::Debug for $name {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(concat!(stringify!($name), "(…)"))
+            }
+        }
+
+        impl $name {
+            /// Finds the library and its functions.
+            fn find() -> Result<Self, $crate::LoadError> {
+                // SAFETY: the files come from the vendor's installer; the types are those of its
+                // header, and the functions live as long as the library beside them.
+                unsafe {
+                    let library = $crate::load::Loaded::first_of($files)?;
+                    Ok(Self {
+                        $($function: library.function($symbol)?,)*
+                        $($plain: library.function($of)?,)*
+                        _library: library,
+                    })
+                }
+            }
+
+            $(
+                #[doc = concat!("`", $of, "`: returns what the library returns.")]
+                pub fn $plain(&self, $($number: $type),*) -> $status {
+                    // SAFETY: the arguments are plain numbers.
+                    unsafe { (self.$plain)($($number),*) }
+                }
+            )*
+        }
+    };
+}
+pub(crate) use library;
+
 /// # Safety
 /// As [`Loaded::first_of`].
 #[cfg(windows)]

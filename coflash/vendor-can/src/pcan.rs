@@ -4,9 +4,8 @@
 //! library for macOS (PCBUSB) exports the same functions.
 
 use std::ffi::c_void;
-use std::fmt;
 
-use crate::load::Loaded;
+use crate::load::library;
 use crate::LoadError;
 
 /// The file names of the library, in the order of preference.
@@ -33,28 +32,18 @@ pub struct Message {
     pub data: [u8; 8],
 }
 
-type Initialize = unsafe extern "system" fn(u16, u16, u8, u32, u16) -> u32;
-type OfChannel = unsafe extern "system" fn(u16) -> u32;
-type Read = unsafe extern "system" fn(u16, *mut Message, *mut c_void) -> u32;
-type Write = unsafe extern "system" fn(u16, *mut Message) -> u32;
-type Value = unsafe extern "system" fn(u16, u8, *mut c_void, u32) -> u32;
-
-/// The library.
-pub struct Pcan {
-    initialize: Initialize,
-    uninitialize: OfChannel,
-    status: OfChannel,
-    read: Read,
-    write: Write,
-    get: Value,
-    set: Value,
-    // The last field, because the functions above belong to it.
-    _library: Loaded,
-}
-
-impl fmt::Debug for Pcan {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Pcan(…)")
+library! {
+    Pcan from FILES,
+    unsafe {
+        initialize: "CAN_Initialize" = fn(u16, u16, u8, u32, u16) -> u32;
+        read: "CAN_Read" = fn(u16, *mut Message, *mut c_void) -> u32;
+        write: "CAN_Write" = fn(u16, *mut Message) -> u32;
+        get: "CAN_GetValue" = fn(u16, u8, *mut c_void, u32) -> u32;
+        set: "CAN_SetValue" = fn(u16, u8, *mut c_void, u32) -> u32;
+    }
+    safe {
+        uninitialize: "CAN_Uninitialize" = fn(channel: u16) -> u32;
+        status: "CAN_GetStatus" = fn(channel: u16) -> u32;
     }
 }
 
@@ -64,21 +53,7 @@ impl Pcan {
     /// # Errors
     /// The library is missing or too old.
     pub fn load() -> Result<Self, LoadError> {
-        // SAFETY: the files come from the vendor's installer; the types are those of PCANBasic.h,
-        // and the functions live as long as the library beside them.
-        unsafe {
-            let library = Loaded::first_of(FILES)?;
-            Ok(Self {
-                initialize: library.function("CAN_Initialize")?,
-                uninitialize: library.function("CAN_Uninitialize")?,
-                status: library.function("CAN_GetStatus")?,
-                read: library.function("CAN_Read")?,
-                write: library.function("CAN_Write")?,
-                get: library.function("CAN_GetValue")?,
-                set: library.function("CAN_SetValue")?,
-                _library: library,
-            })
-        }
+        Self::find()
     }
 
     /// `CAN_Initialize` of a plug-and-play channel, with the two timing registers of an SJA1000.
@@ -86,18 +61,6 @@ impl Pcan {
     pub fn initialize(&self, channel: u16, btr0btr1: u16) -> u32 {
         // SAFETY: the arguments are plain numbers.
         unsafe { (self.initialize)(channel, btr0btr1, 0, 0, 0) }
-    }
-
-    /// `CAN_Uninitialize`.
-    pub fn uninitialize(&self, channel: u16) -> u32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.uninitialize)(channel) }
-    }
-
-    /// `CAN_GetStatus`.
-    pub fn status(&self, channel: u16) -> u32 {
-        // SAFETY: the arguments are plain numbers.
-        unsafe { (self.status)(channel) }
     }
 
     /// `CAN_Read`: returns the oldest message, if the status reports one. Does not wait.

@@ -206,7 +206,7 @@ impl Adapter for Server {
                 Err(RecvTimeoutError::Timeout) if Instant::now() < deadline => {}
                 Err(RecvTimeoutError::Timeout) => return Ok(None),
                 Err(RecvTimeoutError::Disconnected) => {
-                    let source = io::Error::from(ErrorKind::NotConnected);
+                    let source = io::Error::from(ErrorKind::NotConnected).into();
                     return Err(AdapterError::Lost {
                         adapter: format!("the server at {}", self.address),
                         source,

@@ -667,28 +667,36 @@ fn a_state_that_cannot_be_written_keeps_the_device_untouched() {
     assert!(matches!(drive.next(), Step::Flash(_)));
 }
 
+/// What a server may answer to a request.
+fn bodies(request: &Request) -> Vec<Value> {
+    match request {
+        Request::Get(link) if link == "/d" => vec![
+            deployment("8", "forced"),
+            deployment("8", "forced"),
+            deployment("9", "attempt"),
+            deployment("8", "skip"),
+            json!({ "id": 11 }),
+        ],
+        Request::Get(link) if link == "/c" => {
+            vec![json!({ "id": 11, "cancelAction": { "stopId": "8" } }), json!({})]
+        }
+        _ => vec![
+            json!({}),
+            json!({ "_links": { "deploymentBase": { "href": "/d" } } }),
+            json!({ "_links": { "deploymentBase": { "href": "/d" }, "configData": { "href": "/x" } } }),
+            json!({ "_links": { "cancelAction": { "href": "/c" } } }),
+            json!([1, 2]),
+        ],
+    }
+}
+
 /// Whatever order things come in: it never waits without a time, never flashes what is not
 /// in the record, and never more than one thing at once.
 #[test]
 fn no_course_of_answers_brings_it_out_of_step() {
     let mut jitter = Jitter::new(7);
-    let mut pick =
-        move |of: u64| (jitter.after(1, seconds(2_000_000), seconds(2_000_000)).as_micros() as u64) % of;
-    let links = [
-        json!({}),
-        json!({ "_links": { "deploymentBase": { "href": "/d" } } }),
-        json!({ "_links": { "deploymentBase": { "href": "/d" }, "configData": { "href": "/x" } } }),
-        json!({ "_links": { "cancelAction": { "href": "/c" } } }),
-        json!([1, 2]),
-    ];
-    let deployments = [
-        deployment("8", "forced"),
-        deployment("8", "forced"),
-        deployment("9", "attempt"),
-        deployment("8", "skip"),
-        json!({ "id": 11 }),
-    ];
-    let cancels = [json!({ "id": 11, "cancelAction": { "stopId": "8" } }), json!({})];
+    let pause = (seconds(2_000_000), seconds(2_000_000));
+    let mut pick = move |of: usize| jitter.after(1, pause).as_micros() as usize % of;
     let statuses = [200, 200, 200, 200, 200, 200, 200, 200, 400, 401, 404, 410, 429, 500];
     let mut flashes = 0;
     for _ in 0..200 {
@@ -707,7 +715,7 @@ fn no_course_of_answers_brings_it_out_of_step() {
                                 Flashed::NotNow(String::new()),
                                 Flashed::Interrupted,
                             ];
-                            drive.controller.flashed(drive.now, end[pick(4) as usize].clone());
+                            drive.controller.flashed(drive.now, end[pick(4)].clone());
                             flashing = None;
                         }
                         1 if flashing.is_some() => drive.controller.news(News::Kept),
@@ -723,18 +731,13 @@ fn no_course_of_answers_brings_it_out_of_step() {
                     }
                 }
                 Step::Ask(request) => {
-                    let bodies = match request {
-                        Request::Get(link) if link == "/d" => &deployments[..],
-                        Request::Get(link) if link == "/c" => &cancels[..],
-                        _ => &links[..],
-                    };
-                    let body = bodies[pick(bodies.len() as u64) as usize].clone();
-                    drive.answer(statuses[pick(statuses.len() as u64) as usize], &body);
+                    let bodies = bodies(&request);
+                    drive.answer(statuses[pick(statuses.len())], &bodies[pick(bodies.len())]);
                 }
                 Step::Fetch(_) => {
                     let cut = Piece::Cut { more: pick(2) == 0, why: String::new(), retry_after: None };
                     let piece = [Piece::Whole, Piece::Whole, cut, Piece::Wrong(String::new()), Piece::More];
-                    drive.controller.fetched(drive.now, piece[pick(5) as usize].clone());
+                    drive.controller.fetched(drive.now, piece[pick(5)].clone());
                 }
                 Step::Save(record) => {
                     let fails = pick(5) == 0;

@@ -24,7 +24,7 @@ use coflash_agent::{
 use coflash_core::file::block_file;
 use coflash_core::update::Payload;
 use kit::folder::Folder;
-use kit::hawkbit::{sha256, Action, Fault, File, Server};
+use kit::hawkbit::{sha256, Action, Fault, File, Server, State};
 
 /// A block file that was made by another program.
 const PROGRAM: &[u8] = data!("identity-110.blk");
@@ -77,6 +77,11 @@ impl Devices for Fake {
 /// A folder of one test, deleted at its end.
 fn folder(test: &str) -> Folder {
     Folder::below(env!("CARGO_TARGET_TMPDIR"), test)
+}
+
+/// The action of the device, as the server has it.
+fn action(state: &State) -> &Action {
+    state.targets[ID].action.as_ref().unwrap()
 }
 
 fn file() -> File {
@@ -325,20 +330,11 @@ fn a_cancellation_during_the_update_is_rejected_with_a_reason() {
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
     while_it_runs(&server, &folder, &fake, || {
-        let progress = |state: &kit::hawkbit::State| {
-            state.targets[ID].action.as_ref().is_some_and(|action| action.progress.contains(&40))
-        };
-        server.wait("progress", progress);
+        server.wait("progress", |state| action(state).progress.contains(&40));
         server.state().targets.get_mut(ID).unwrap().action.as_mut().unwrap().cancelling = true;
-        let rejected = |state: &kit::hawkbit::State| {
-            state.targets[ID].action.as_ref().is_some_and(|action| !action.rejected.is_empty())
-        };
-        server.wait("a rejection", rejected);
+        server.wait("a rejection", |state| !action(state).rejected.is_empty());
         busy.store(false, Ordering::Relaxed);
-        let ended = |state: &kit::hawkbit::State| {
-            state.targets[ID].action.as_ref().is_some_and(|action| action.result.is_some())
-        };
-        server.wait("the end", ended);
+        server.wait("the end", |state| action(state).result.is_some());
     });
     let action = server.action(ID);
     assert_eq!(action.result.as_deref(), Some("success"));
@@ -387,9 +383,7 @@ fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
     while_it_runs(&server, &folder, &fake, || {
-        server.wait("progress", |state| {
-            state.targets[ID].action.as_ref().is_some_and(|action| action.progress.contains(&40))
-        });
+        server.wait("progress", |state| action(state).progress.contains(&40));
         server.fault("feedback", 1000, Fault::Status(500, None));
         busy.store(false, Ordering::Relaxed);
         server.wait("an attempt", |state| {
@@ -461,9 +455,7 @@ fn a_result_that_comes_while_the_agent_ends_is_kept() {
     let config = config(&server, &folder, &[ID]);
     thread::scope(|scope| {
         let agent = scope.spawn(|| run(&config, &endless, &fake, &|_| {}).unwrap());
-        server.wait("progress", |state| {
-            state.targets[ID].action.as_ref().is_some_and(|action| action.progress.contains(&40))
-        });
+        server.wait("progress", |state| action(state).progress.contains(&40));
         cancelled.store(true, Ordering::Relaxed);
         busy.store(false, Ordering::Relaxed);
         agent.join().unwrap();
@@ -533,9 +525,7 @@ fn a_state_file_that_is_put_right_is_read_while_the_agent_runs() {
         thread::sleep(Duration::from_millis(50));
         assert!(fake.given().is_empty());
         std::fs::remove_file(&record).unwrap();
-        server.wait("the end", |state| {
-            state.targets[ID].action.as_ref().is_some_and(|action| action.result.is_some())
-        });
+        server.wait("the end", |state| action(state).result.is_some());
     });
     assert_eq!(fake.given().len(), 1);
 }

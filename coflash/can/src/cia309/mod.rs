@@ -27,7 +27,7 @@ use self::line::{Line, ERROR};
 use super::adapter::AdapterError;
 use super::found::shown;
 use super::gateway::{Ask, Gateway, GatewayError};
-use super::tcp;
+use super::tcp::{self, waits};
 
 mod base64;
 mod line;
@@ -94,13 +94,8 @@ impl Cia309 {
     /// [`AdapterError::Open`].
     pub fn connect(server: &str, network: u16) -> Result<Self, AdapterError> {
         let name = format!("CiA 309-3 gateway {server}");
-        let open = |source| AdapterError::Open { adapter: name.clone(), source };
-        let stream = tcp::connect(server, Some(DEFAULT_PORT)).map_err(open)?;
-        stream.set_nodelay(true).map_err(open)?;
-        stream.set_read_timeout(Some(SLICE)).map_err(open)?;
-        stream.set_write_timeout(Some(SLICE)).map_err(open)?;
         Ok(Self {
-            stream,
+            stream: tcp::connect(&name, server, Some(DEFAULT_PORT), SLICE)?,
             name,
             network,
             opened: Instant::now(),
@@ -113,7 +108,7 @@ impl Cia309 {
     }
 
     fn lost(&self, source: io::Error) -> AdapterError {
-        AdapterError::Lost { adapter: self.name.clone(), source }
+        AdapterError::Lost { adapter: self.name.clone(), source: source.into() }
     }
 
     fn protocol(&self, said: &str) -> AdapterError {
@@ -369,11 +364,6 @@ impl fmt::Display for Wait<'_> {
     }
 }
 
-/// Whether the error only means that the socket has no data at present.
-fn waits(error: &io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
-}
-
 impl Gateway for Cia309 {
     fn upload(&mut self, ask: &Ask<'_>, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError> {
         self.set_timeout(ask.sdo, ask.cancelled)?;
@@ -384,7 +374,7 @@ impl Gateway for Cia309 {
         if let Some(error) = self.error(&answer) {
             return Err(error);
         }
-        base64::decode(answer.as_bytes()).ok_or_else(|| {
+        base64::decode(&answer).ok_or_else(|| {
             let said = format!("'{answer}', which is not a domain in base64");
             self.protocol(&said).into()
         })

@@ -210,11 +210,11 @@ pub fn parse(bytes: &[u8], channel: u8) -> Result<Said, String> {
 
 #[cfg(test)]
 mod tests {
-    use canopen::CobId;
     use embedded_can::ExtendedId;
     use proptest::prelude::*;
 
     use super::*;
+    use crate::tests::frame;
 
     /// The constants of a candleLight with an STM32F072: tseg1 1..16, tseg2 1..8, sjw 1..4, brp
     /// 1..1024, step 1, clock 48 MHz (its bit timing constants, as `ip -details` shows them).
@@ -222,10 +222,6 @@ mod tests {
         0x53, 0, 0, 0, 0x00, 0x6C, 0xDC, 0x02, 1, 0, 0, 0, 16, 0, 0, 0, 1, 0, 0, 0, 8, 0, 0, 0, 4, 0, 0, 0,
         1, 0, 0, 0, 0, 4, 0, 0, 1, 0, 0, 0,
     ];
-
-    fn frame(id: u16, data: &[u8]) -> Frame {
-        Frame::of(CobId::new(id).unwrap(), data)
-    }
 
     #[test]
     fn constants_are_read_and_give_the_timing_of_the_kernel() {

@@ -71,7 +71,7 @@ pub struct Port {
 impl Port {
     /// The hub outlives its ports. If it does not, the port reports a lost adapter.
     fn hub_is_gone() -> AdapterError {
-        let source = io::Error::from(io::ErrorKind::BrokenPipe);
+        let source = io::Error::from(io::ErrorKind::BrokenPipe).into();
         AdapterError::Lost { adapter: "the hub".to_string(), source }
     }
 
@@ -269,7 +269,7 @@ fn serve(
     let deadlines = in_turn.filter_map(|(_, line)| waiting(line.as_ref()?));
     let deadlines = deadlines.chain(meetings.deadline()).chain(turns.deadline());
     let received = match (&lost, deadlines.min()) {
-        (Some(error), _) => Err(copy(error)),
+        (Some(error), _) => Err(error.clone()),
         (None, None) => return,
         (None, Some(earliest)) => adapter.receive(earliest.saturating_sub(adapter.now())),
     };
@@ -282,7 +282,7 @@ fn serve(
         let until = match (&line.state, &received) {
             (State::Waiting { until }, _) => *until,
             (State::Meeting(_), Err(error)) => {
-                line.wake(Err(copy(error)), now);
+                line.wake(Err(error.clone()), now);
                 continue;
             }
             _ => continue,
@@ -296,7 +296,7 @@ fn serve(
             // Its frames are not sent yet, so its time has not begun.
             Ok(_) if turns.hold(port) => continue,
             Ok(_) => Ok(None),
-            Err(error) => Err(copy(error)),
+            Err(error) => Err(error.clone()),
         };
         turns.woken(port, now);
         line.wake(frame.map(What::Frame), now);
@@ -318,33 +318,4 @@ fn concerns(frame: &Frame, node: NodeId) -> bool {
 /// another node-ID.
 fn is_strangers_boot_up(frame: &Frame, nodes: &[NodeId]) -> bool {
     parse_boot_up(frame).is_some_and(|node| !nodes.contains(&node))
-}
-
-/// Copies the error, so that each conversation gets it.
-fn copy(error: &AdapterError) -> AdapterError {
-    let again = |source: &io::Error| match source.raw_os_error() {
-        Some(code) => io::Error::from_raw_os_error(code),
-        None => io::Error::new(source.kind(), source.to_string()),
-    };
-    match error {
-        AdapterError::Url { url, why } => AdapterError::Url { url: url.clone(), why: why.clone() },
-        AdapterError::Unusable { adapter, what, advice, obstacle } => {
-            AdapterError::unusable(adapter, *obstacle, what, advice)
-        }
-        AdapterError::Stuck { adapter, health } => {
-            AdapterError::Stuck { adapter: adapter.clone(), health: *health }
-        }
-        AdapterError::Open { adapter, source } => {
-            AdapterError::Open { adapter: adapter.clone(), source: again(source) }
-        }
-        AdapterError::Protocol { adapter, said } => {
-            AdapterError::Protocol { adapter: adapter.clone(), said: said.clone() }
-        }
-        AdapterError::Lost { adapter, source } => {
-            AdapterError::Lost { adapter: adapter.clone(), source: again(source) }
-        }
-        AdapterError::Gateway { adapter, what } => {
-            AdapterError::Gateway { adapter: adapter.clone(), what: what.clone() }
-        }
-    }
 }

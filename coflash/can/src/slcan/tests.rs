@@ -2,14 +2,10 @@
 
 use std::collections::VecDeque;
 
-use canopen::CobId;
 use proptest::prelude::*;
 
 use super::*;
-
-fn frame(id: u16, data: &[u8]) -> Frame {
-    Frame::of(CobId::new(id).unwrap(), data)
-}
+use crate::tests::frame;
 
 /// Examples of the CAN232 manual.
 #[test]

@@ -106,7 +106,7 @@ mod tests {
         }
         let node = NodeId::new(5).unwrap();
         let adapter = || "can0".to_string();
-        let open = |kind| AdapterError::Open { adapter: adapter(), source: io::Error::from(kind) };
+        let open = |kind| AdapterError::Open { adapter: adapter(), source: io::Error::from(kind).into() };
         let unusable = |obstacle| AdapterError::Unusable {
             adapter: adapter(),
             what: String::new(),

@@ -13,35 +13,6 @@ use super::row::{Row, RowState, Step};
 use super::setup::Origin;
 use super::words::Language;
 
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &[
-    "report-title",
-    "report-good",
-    "report-had",
-    "report-bad",
-    "report-date",
-    "report-result",
-    "report-adapter",
-    "report-tool",
-    "report-missing",
-    "report-unknown",
-    "operator",
-    "order",
-    "device-number",
-    "device",
-    "node",
-    "identity",
-    "serial",
-    "program",
-    "from",
-    "to",
-    "no-program",
-    "what-happened",
-    "disk-full",
-    "not-saved",
-];
-
 /// The names of the columns. They are the same in each language, so that a table takes all reports.
 const COLUMNS: &str = "date,result,node,device,vendor_id,product_code,revision,serial_number,program,from,to,\
                        program_result,error_number,error,operator,order,device_number,package,release,file,adapter,tool";

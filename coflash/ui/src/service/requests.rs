@@ -23,11 +23,6 @@ use crate::adapters;
 use crate::http::{bad, body, done, download, idle, json_response, node_id, password_of};
 use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
 use crate::shared::Order;
-use crate::state::Notice;
-
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
 
 const FILES: [(&str, &str, &str); 9] = [
     ("", HTML, concat!(include_str!("../page/head.html"), include_str!("page/service.html"))),
@@ -142,9 +137,8 @@ async fn update(
     }
     let unlock = password_of(&password)?;
     let Some(plan) = station.plan(number) else {
-        let notice =
-            Notice::failed("there is a newer plan, or none", "look at the devices, and confirm again");
-        return Err(Refused(StatusCode::CONFLICT, notice));
+        let (words, advice) = ("there is a newer plan, or none", "look at the devices, and confirm again");
+        return Err(Refused::new(StatusCode::CONFLICT, words, advice));
     };
     let nodes = nodes.into_iter().map(node_id).collect::<Result<BTreeSet<NodeId>, Refused>>()?;
     let due: BTreeSet<NodeId> =
@@ -178,8 +172,8 @@ async fn report(
     Query(Wanted { number }): Query<Wanted>,
 ) -> Answer {
     let Some(report) = station.unsaved(number) else {
-        let notice = Notice::failed("there is no such report", "it may have been saved meanwhile");
-        return Err(Refused(StatusCode::NOT_FOUND, notice));
+        let (words, advice) = ("there is no such report", "it may have been saved meanwhile");
+        return Err(Refused::new(StatusCode::NOT_FOUND, words, advice));
     };
     let [(ending, html), _] = report.contents();
     Ok(download(&format!("{}.{ending}", report.name()), "text/html; charset=utf-8", html))

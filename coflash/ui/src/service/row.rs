@@ -8,20 +8,6 @@ use super::message::Message;
 use super::trouble;
 use crate::state;
 
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &[
-    "state-has",
-    "state-due",
-    "state-left-out",
-    "state-waiting",
-    "state-working",
-    "state-updated",
-    "state-failed",
-    "other-silent",
-    "other-mute",
-];
-
 /// A device, or one that is missing.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Row {

@@ -11,10 +11,6 @@ use super::folder::Folder;
 /// The most bytes of the file with the adapter.
 const URL_MAX: usize = 1000;
 
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &["package", "job-file"];
-
 /// Where the programs of a station come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {

@@ -13,37 +13,6 @@ use super::setup::Service;
 use crate::shared::{lock, Shared};
 use crate::state;
 
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &[
-    "closed",
-    "opening",
-    "lost",
-    "ready",
-    "searching",
-    "planned",
-    "planned-bad",
-    "complete",
-    "none",
-    "working",
-    "good",
-    "good-unsaved",
-    "bad",
-    "adapter-lost",
-    "adapter-failed",
-    "internal",
-    "hint-closed",
-    "hint-ready",
-    "hint-planned",
-    "hint-planned-bad",
-    "hint-incomplete",
-    "hint-none",
-    "hint-working",
-    "hint-good",
-    "hint-good-unsaved",
-    "hint-bad",
-];
-
 /// What is being done, and the devices of it.
 #[derive(Clone, Debug, Default)]
 pub(super) enum Stage {

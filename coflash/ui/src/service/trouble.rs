@@ -7,35 +7,6 @@ use coflash_core::update::DeviceState;
 
 use super::message::Message;
 
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &[
-    "trouble-adapter",
-    "trouble-cancelled",
-    "trouble-no-answer",
-    "trouble-refused",
-    "trouble-busy",
-    "trouble-other-device",
-    "trouble-password",
-    "trouble-wrong-password",
-    "trouble-not-alone",
-    "trouble-no-start",
-    "trouble-refuses-now",
-    "trouble-renewal",
-    "trouble-crc",
-    "trouble-other",
-    "trouble-absent",
-    "trouble-mute",
-    "trouble-too-few",
-    "trouble-exchanged",
-    "trouble-earlier",
-    "left-untouched",
-    "left-old",
-    "left-unknown",
-    "left-none",
-    "left-new",
-];
-
 /// The message of an error.
 pub(super) fn of_error(error: &Error) -> Message {
     let key = match error {

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use canopen::NodeId;
-use coboot_can::Link;
+use coboot_can::{wall, Link};
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{self, Plan, PlanError, RunOptions, Todo};
@@ -16,13 +16,8 @@ use super::report::{unsaved, Entered, Of};
 use super::row::{note, rows, Row};
 use super::station::{change, reports, Stage, Station};
 use super::trouble;
-use crate::frames::wall;
 use crate::shared::{Shared, Work};
 use crate::state::{self, Notice, Phase};
-
-/// The keys of this module, for the test of the table.
-#[cfg(test)]
-pub(super) const KEYS: &[&str] = &["gateway", "two-programs"];
 
 /// Search the devices of the package, and make a plan.
 pub(super) struct Search(pub(super) Arc<Station>);

@@ -125,12 +125,21 @@ impl Ui {
         self.request("POST", &format!("{}{what}?name={name}", self.path), &[&self.host_line()], bytes)
     }
 
+    /// A reader of the events, which has read the status of the answer.
+    fn events(&self, query: &str) -> TcpStream {
+        let mut stream = self.stream();
+        let request = format!("GET {}events{query} HTTP/1.1\r\n{}\r\n\r\n", self.path, self.host_line());
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut head = [0; 12];
+        stream.read_exact(&mut head).unwrap();
+        assert_eq!(&head, b"HTTP/1.1 200");
+        stream
+    }
+
     /// Follows the events until `wanted` accepts the state; returns the state.
     #[track_caller]
     fn until(&self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
-        let mut stream = self.stream();
-        let request = format!("GET {}events HTTP/1.1\r\n{}\r\n\r\n", self.path, self.host_line());
-        stream.write_all(request.as_bytes()).unwrap();
+        let mut stream = self.events("");
         let mut text = Vec::new();
         let mut last = Value::Null;
         let began = std::time::Instant::now();
@@ -164,6 +173,15 @@ impl Ui {
 impl Drop for Ui {
     fn drop(&mut self) {
         self.end.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Waits until something has come about.
+fn wait(what: &str, mut has_come: impl FnMut() -> bool) {
+    let began = std::time::Instant::now();
+    while !has_come() {
+        assert!(began.elapsed() < PATIENCE, "never: {what}");
+        thread::sleep(Duration::from_millis(20));
     }
 }
 
@@ -450,11 +468,7 @@ fn uploads_are_limited_together_and_before_they_are_read() {
     // A small file has no room either, and has it when the large ones are gone.
     assert_eq!(ui.file("app.hex", HEX).status, 503);
     drop(open);
-    let began = std::time::Instant::now();
-    while ui.file("app.hex", HEX).status != 200 {
-        assert!(began.elapsed() < PATIENCE, "the room is never given back");
-        thread::sleep(Duration::from_millis(20));
-    }
+    wait("the room is given back", || ui.file("app.hex", HEX).status == 200);
 }
 
 /// An upload without a length counts as the largest one, and ends at that size.
@@ -491,12 +505,7 @@ fn an_upload_that_stops_is_ended_with_words() {
 fn connections_that_send_nothing_do_not_keep_the_page_away() {
     // No time-out of an idle connection can help within this test.
     let ui = Ui::with(|options| options.head_timeout = Duration::from_secs(3600));
-    let (path, host) = (&ui.path, ui.host_line());
-    let known = format!("GET {path}events HTTP/1.1\r\n{host}\r\n\r\n");
-    let mut page = ui.stream();
-    page.write_all(known.as_bytes()).unwrap();
-    let mut head = [0; 12];
-    page.read_exact(&mut head).unwrap();
+    let _page = ui.events("");
     for sent in ["", "G", "GET / HTTP/1.1\r\nHost: ", "GET / HTTP/1.1\r\nHost: x\r\n\r\n"] {
         let idle: Vec<TcpStream> = (0..200)
             .map(|_| {
@@ -727,22 +736,13 @@ fn flood() -> String {
 fn a_reader_that_stops_reading_is_dropped() {
     let ui = Ui::new(Some(flood()));
     ui.until("the adapter", |state| state["adapter"]["state"] == "open");
-    let mut lazy = ui.stream();
-    let request = format!("GET {}events?frames=1 HTTP/1.1\r\n{}\r\n\r\n", ui.path, ui.host_line());
-    lazy.write_all(request.as_bytes()).unwrap();
-    let mut head = [0; 12];
-    lazy.read_exact(&mut head).unwrap();
-    assert_eq!(&head, b"HTTP/1.1 200");
+    let _lazy = ui.events("?frames=1");
     // From here on it reads nothing. Other pages are served until it is dropped.
-    let began = std::time::Instant::now();
-    let mut served = 0;
-    while (ui.readers)() > 0 {
+    assert!((ui.readers)() > 0, "it was a reader at first");
+    wait("it is dropped", || {
         assert_eq!(ui.get("adapters").status, 200);
-        served += 1;
-        assert!(began.elapsed() < PATIENCE, "it is never dropped");
-        thread::sleep(Duration::from_millis(20));
-    }
-    assert!(served > 0, "it was a reader at first");
+        (ui.readers)() == 0
+    });
     // Its place is free again, and a page that reads gets events.
     ui.until("an event", |state| state["adapter"]["state"] == "open");
 }
@@ -751,24 +751,11 @@ fn a_reader_that_stops_reading_is_dropped() {
 #[test]
 fn more_readers_than_there_are_places_are_refused() {
     let ui = Ui::new(None);
-    let request = format!("GET {}events HTTP/1.1\r\n{}\r\n\r\n", ui.path, ui.host_line());
-    let mut kept = Vec::new();
-    for number in 0..32 {
-        let mut stream = ui.stream();
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut head = [0; 12];
-        stream.read_exact(&mut head).unwrap();
-        assert_eq!(&head, b"HTTP/1.1 200", "{number}");
-        kept.push(stream);
-    }
+    let kept: Vec<TcpStream> = (0..32).map(|_| ui.events("")).collect();
     assert_eq!(ui.get("events").status, 503);
     assert_eq!(ui.get("adapters").status, 200);
     drop(kept);
-    let began = std::time::Instant::now();
-    while (ui.readers)() > 0 {
-        assert!(began.elapsed() < PATIENCE, "places are not given back");
-        thread::sleep(Duration::from_millis(20));
-    }
+    wait("places are given back", || (ui.readers)() == 0);
     ui.until("an event", |state| state["adapter"]["state"] == "closed");
 }
 

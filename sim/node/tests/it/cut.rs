@@ -195,7 +195,7 @@ impl CutBus {
 impl Adapter for CutBus {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
         if matches!(self.way, Some(Way::Host(stop)) if self.frames >= stop) {
-            let source = io::Error::from(io::ErrorKind::NotConnected);
+            let source = io::Error::from(io::ErrorKind::NotConnected).into();
             return Err(AdapterError::Lost { adapter: "the host".into(), source });
         }
         self.frames += 1;

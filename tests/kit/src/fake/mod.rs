@@ -633,7 +633,7 @@ impl Adapter for Fake {
         self.now += Duration::from_micros(250);
         self.tick();
         if self.frames_left == 0 {
-            let source = io::Error::from(io::ErrorKind::BrokenPipe);
+            let source = io::Error::from(io::ErrorKind::BrokenPipe).into();
             return Err(AdapterError::Lost { adapter: "fake".to_string(), source });
         }
         self.frames_left -= 1;

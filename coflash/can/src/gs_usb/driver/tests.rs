@@ -2,10 +2,9 @@
 
 use std::collections::VecDeque;
 
-use canopen::CobId;
-
 use super::*;
 use crate::health::Trouble;
+use crate::tests::frame;
 
 /// A device: the transfers that it sends, and those that it received.
 #[derive(Default)]
@@ -49,10 +48,6 @@ impl Usb for &mut Fake {
             next => Ok(next),
         }
     }
-}
-
-fn frame(id: u16, data: &[u8]) -> Frame {
-    Frame::of(CobId::new(id).unwrap(), data)
 }
 
 fn echo(echo: u32, channel: u8) -> Vec<u8> {
