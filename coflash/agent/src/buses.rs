@@ -12,12 +12,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_ID};
 use canopen::Address;
 
-use super::config::{Device, Target, What};
+use super::config::{Device, Target, TargetKind};
 use super::controller::{Flashed, News};
 use super::firmware::Content;
 use super::machine;
+use super::progress::{failure, waits, Shown};
 use super::run::{Devices, Order};
-use super::told::{failure, waits, Shown};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::state::{reason, source, supply};
@@ -133,8 +133,8 @@ impl Buses<'_> {
 }
 
 impl Devices for Buses<'_> {
-    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
-        let What::Device(device) = &target.what else {
+    fn attributes(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
+        let TargetKind::Device(device) = &target.what else {
             // A scan would end the transfers of other tools, only to tell this.
             return Ok(of_agent(target));
         };

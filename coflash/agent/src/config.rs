@@ -37,7 +37,7 @@ pub struct Target {
     /// The URL of its bus.
     pub bus: String,
     /// What is there.
-    pub what: What,
+    pub what: TargetKind,
     pub(super) part: Option<String>,
     pub(super) artifact: Option<String>,
     pub(super) attempt: Attempt,
@@ -47,7 +47,7 @@ pub struct Target {
 
 /// What a target is.
 #[derive(Clone, Debug)]
-pub enum What {
+pub enum TargetKind {
     /// One device, which gets programs.
     Device(Device),
     /// The devices of a bus, which get packages.
@@ -244,11 +244,11 @@ impl Config {
             Ok(())
         };
         for entry in &file.device {
-            let what = || entry.own.device(file.board.as_deref(), folder).map(What::Device);
+            let what = || entry.own.device(file.board.as_deref(), folder).map(TargetKind::Device);
             add("device", &entry.controller_id, entry.target(&common, &what))?;
         }
         for entry in &file.machine {
-            let what = || entry.own.machine(folder).map(What::Machine);
+            let what = || entry.own.machine(folder).map(TargetKind::Machine);
             add("machine", &entry.controller_id, entry.target(&common, &what))?;
         }
         Ok(Self {
@@ -273,8 +273,8 @@ impl Target {
     /// Whether both have one name, or are one device, or the machine of one bus.
     fn is_the_same(&self, other: &Self) -> bool {
         let is_one = match (&self.what, &other.what) {
-            (What::Device(one), What::Device(other)) => one.node == other.node,
-            (What::Machine(_), What::Machine(_)) => true,
+            (TargetKind::Device(one), TargetKind::Device(other)) => one.node == other.node,
+            (TargetKind::Machine(_), TargetKind::Machine(_)) => true,
             _ => false,
         };
         self.controller == other.controller || is_one && self.bus == other.bus
@@ -282,7 +282,11 @@ impl Target {
 }
 
 impl<T> Entry<T> {
-    fn target(&self, common: &Common<'_>, what: &dyn Fn() -> Result<What, String>) -> Result<Target, String> {
+    fn target(
+        &self,
+        common: &Common<'_>,
+        what: &dyn Fn() -> Result<TargetKind, String>,
+    ) -> Result<Target, String> {
         name("controller-id", &self.controller_id)?;
         let own = (common.token)(Source {
             file: self.token_file.as_deref(),
@@ -433,7 +437,7 @@ mod tests {
         };
         let good = machine("press", "trust = ['root.pub']");
         let config = read(&format!("{DOOR}{good}")).unwrap();
-        let [Target { what: What::Device(_), .. }, Target { what: What::Machine(machine_of), .. }] =
+        let [Target { what: TargetKind::Device(_), .. }, Target { what: TargetKind::Machine(machine_of), .. }] =
             config.targets.as_slice()
         else {
             panic!("{config:?}")

@@ -26,7 +26,7 @@ pub(super) enum Step {
     /// The record is to be written; the answer goes to [`Controller::saved`].
     Save(Record),
     /// The device is to be asked for its attributes, while other steps go on; the answer goes to
-    /// [`Controller::looked`].
+    /// [`Controller::device_answered`].
     AskDevice,
     /// The device is to be flashed, while other steps go on; the answer goes to
     /// [`Controller::flashed`].
@@ -115,7 +115,7 @@ pub enum News {
 /// A message for the people who run the agent.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Said {
+pub struct Message {
     /// The device.
     pub controller: String,
     /// What it is about.
@@ -308,7 +308,7 @@ pub(super) struct Controller {
     failures: u32,
     /// Whether the server has answered a poll.
     polled: bool,
-    said: Vec<Said>,
+    said: Vec<Message>,
 }
 
 impl Controller {
@@ -342,7 +342,7 @@ impl Controller {
     }
 
     /// The messages since the last call.
-    pub(super) fn said(&mut self) -> Vec<Said> {
+    pub(super) fn said(&mut self) -> Vec<Message> {
         std::mem::take(&mut self.said)
     }
 
@@ -768,7 +768,7 @@ impl Controller {
     }
 
     /// The attributes of the device, or why there are none.
-    pub(super) fn looked(&mut self, told: Result<Vec<(String, String)>, String>) {
+    pub(super) fn device_answered(&mut self, told: Result<Vec<(String, String)>, String>) {
         self.query = DeviceQuery::No;
         match told {
             Ok(attributes) => self.todo.push_back(Ask::Config(attributes)),
@@ -797,7 +797,7 @@ impl Controller {
             News::Failed(update) => {
                 let text = format!("action {}: the update of node {} has failed", task.action, update.node);
                 let (controller, kind) = (self.name.clone(), Kind::Report);
-                self.said.push(Said { controller, kind, text, update: Some(update) });
+                self.said.push(Message { controller, kind, text, update: Some(update) });
             }
             News::Percent(percent) => {
                 let percent = percent.min(100);
@@ -893,7 +893,7 @@ impl Controller {
     }
 
     fn say(&mut self, kind: Kind, text: String) {
-        self.said.push(Said { controller: self.name.clone(), kind, text, update: None });
+        self.said.push(Message { controller: self.name.clone(), kind, text, update: None });
     }
 }
 

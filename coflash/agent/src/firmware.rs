@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::config::{Device, Machine, Target, What};
+use super::config::{Device, Machine, Target, TargetKind};
 use coflash_core::file::ram_image;
 use coflash_core::machine::{is_package, Fault, Package, SignatureFault};
 use coflash_core::update::{ContentFault, Payload, Reading};
@@ -22,13 +22,15 @@ pub enum Content<'t> {
 /// The lines for the server: what is wrong, and what to do.
 pub(super) fn content<'t>(bytes: &[u8], name: &str, target: &'t Target) -> Result<Content<'t>, Vec<String>> {
     match &target.what {
-        What::Machine(machine) => package(bytes, name, machine).map(Box::new).map(Content::Package),
-        What::Device(_) if is_package(Path::new(name), bytes) => Err(lines(
+        TargetKind::Machine(machine) => package(bytes, name, machine).map(Box::new).map(Content::Package),
+        TargetKind::Device(_) if is_package(Path::new(name), bytes) => Err(lines(
             format!("{name} is a package for a machine, and this target is one device"),
             "deploy the program of this device alone, or give the package to a target that the agent's \
              configuration names as a [[machine]]",
         )),
-        What::Device(device) => program(bytes, name, device).map(|program| Content::Program(device, program)),
+        TargetKind::Device(device) => {
+            program(bytes, name, device).map(|program| Content::Program(device, program))
+        }
     }
 }
 

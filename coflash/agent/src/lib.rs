@@ -14,7 +14,7 @@
 //! | `download` | artifacts: fetched piece by piece, checked |
 //! | `firmware` | the artifact as a program of a device, or as a package for a machine |
 //! | `buses` | the devices, and those of machines |
-//! | `told` | what the server hears of an update |
+//! | `progress` | what the server hears of an update |
 //! | `machine` | an update with a package, in words for the server |
 //! | `run` | a thread for each target, which joins these parts |
 //!
@@ -31,14 +31,14 @@ mod firmware;
 mod http;
 mod machine;
 mod pause;
+mod progress;
 mod record;
 mod run;
-mod told;
 mod url;
 
 pub use self::buses::{Buses, Open};
-pub use self::config::{Config, Device, Fault, Machine, Target, What};
-pub use self::controller::{Flashed, Kind, News, Said};
+pub use self::config::{Config, Device, Fault, Machine, Target, TargetKind};
+pub use self::controller::{Flashed, Kind, Message, News};
 pub use self::firmware::Content;
 pub use self::run::{run, CannotStart, Devices, Ended, Options, Order, Times};
 

@@ -15,7 +15,7 @@ use coflash_core::update::{Event, ManyOptions};
 use coflash_core::Error;
 
 use super::controller::{Flashed, News};
-use super::told::{failure, not_now, waits, Shown};
+use super::progress::{failure, not_now, waits, Shown};
 
 /// Updates the devices of a bus that the package is for. An interrupted update goes on with another call:
 /// its plan leaves out what the devices have.

@@ -12,7 +12,7 @@ use crc::{Crc, CRC_64_XZ};
 
 use super::backoff::Jitter;
 use super::config::{Config, Target};
-use super::controller::{Controller, Flash, Flashed, Kind, News, Rules, Said, Step, Wanted};
+use super::controller::{Controller, Flash, Flashed, Kind, Message, News, Rules, Step, Wanted};
 use super::download::{self, Pause};
 use super::firmware::{self, Content};
 use super::http::{Client, Limits};
@@ -25,7 +25,7 @@ pub trait Devices: Sync {
     ///
     /// # Errors
     /// In words, if the device does not answer.
-    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String>;
+    fn attributes(&self, target: &Target) -> Result<Vec<(String, String)>, String>;
 
     /// Flashes a device or those of a machine, and says what happens.
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed;
@@ -104,7 +104,7 @@ const ONCE_FAILURES: u32 = 4;
 
 /// What a thread hears while it waits.
 enum Heard {
-    Looked(Result<Vec<(String, String)>, String>),
+    Attributes(Result<Vec<(String, String)>, String>),
     News(News),
     Flashed(Flashed),
 }
@@ -114,7 +114,7 @@ struct Shared<'r> {
     config: &'r Config,
     options: &'r Options,
     devices: &'r dyn Devices,
-    tell: &'r (dyn Fn(&Said) + Sync),
+    tell: &'r (dyn Fn(&Message) + Sync),
     client: Client,
     limits: Limits,
     store: Store,
@@ -129,7 +129,7 @@ pub fn run(
     config: &Config,
     options: &Options,
     devices: &dyn Devices,
-    tell: &(dyn Fn(&Said) + Sync),
+    tell: &(dyn Fn(&Message) + Sync),
 ) -> Result<Ended, CannotStart> {
     let folder = &config.state;
     let unusable = |error: &dyn std::fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
@@ -177,7 +177,7 @@ fn record(shared: &Shared<'_>, target: &Target, root: &str, seed: u64) -> Option
             Ok(record) => return Some(record),
             Err(why) => why,
         };
-        (shared.tell)(&Said {
+        (shared.tell)(&Message {
             controller: target.controller.clone(),
             kind: Kind::Trouble,
             text: why,
@@ -262,7 +262,7 @@ fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
                 Step::AskDevice => {
                     let sender = sender.clone();
                     scope.spawn(move || {
-                        let _ = sender.send(Heard::Looked(shared.devices.look(target)));
+                        let _ = sender.send(Heard::Attributes(shared.devices.attributes(target)));
                     });
                 }
                 Step::Flash(Flash { wanted, kept }) => {
@@ -284,7 +284,7 @@ fn wait(shared: &Shared<'_>, controller: &mut Controller, heard: &Receiver<Heard
     loop {
         let now = shared.began.elapsed();
         match next {
-            Ok(Heard::Looked(told)) => controller.looked(told),
+            Ok(Heard::Attributes(told)) => controller.device_answered(told),
             Ok(Heard::News(news)) => controller.news(news),
             Ok(Heard::Flashed(flashed)) => controller.flashed(now, flashed),
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => return,

@@ -56,7 +56,7 @@ pub trait Group {
     ///
     /// # Errors
     /// The adapter is gone.
-    fn meet(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Met, AdapterError>;
+    fn deliver(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Delivery, AdapterError>;
 
     /// Leaves the group: it does not wait for this conversation any more.
     fn leave(&mut self);
@@ -64,7 +64,7 @@ pub trait Group {
 
 /// What became of the data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Met {
+pub enum Delivery {
     /// The device has taken the data, as one of so many devices.
     Taken(usize),
     /// The device has refused the data.

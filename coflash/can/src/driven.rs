@@ -87,7 +87,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// How long the thread waits for a received frame before it checks for a frame to send.
 const TURN: Duration = Duration::from_millis(1);
 /// How often the driver is asked for the state of the bus.
-const LOOK: Duration = Duration::from_millis(50);
+const STATUS_PERIOD: Duration = Duration::from_millis(50);
 /// The most frames that may wait to be sent or to be received. Further frames are lost, as in a
 /// controller that is not read.
 const OUTGOING: usize = 64;
@@ -209,7 +209,7 @@ fn work(
                 return Ok(());
             }
         }
-        if looked.elapsed() >= LOOK {
+        if looked.elapsed() >= STATUS_PERIOD {
             looked = Instant::now();
             lock(status).health = driver.health();
         }

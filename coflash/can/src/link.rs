@@ -3,8 +3,10 @@
 use std::fmt;
 
 use super::adapter::{Adapter, AdapterError};
+use super::cia309::Cia309;
 use super::gateway::Gateway;
-use super::{cia309, open};
+use super::open;
+use super::target::Target;
 
 /// Access to devices. Commands that need frames use the bus; commands that need objects use a
 /// `Session` of `coflash-core`.
@@ -31,9 +33,11 @@ impl Link {
     /// # Errors
     /// The URL is invalid, or its target does not open.
     pub fn open(url: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
-        match url.strip_prefix("cia309:") {
-            Some(rest) => Ok(Self::Gateway(Box::new(cia309::open(url, rest)?))),
-            None => open::open_at(url, bit_rate).map(Self::Bus),
+        match open::target(url)? {
+            Target::Gateway { server, network } => {
+                Ok(Self::Gateway(Box::new(Cia309::connect(&server, network)?)))
+            }
+            _ => open::open_at(url, bit_rate).map(Self::Bus),
         }
     }
 }

@@ -31,8 +31,6 @@ pub(super) struct Link {
 
 /// All CAN interfaces.
 pub(super) fn all() -> Result<Vec<Link>, Missing> {
-    let missing =
-        |what: String| Missing { what, advice: "install iproute2, whose program ip sets up CAN interfaces" };
     let mut last = String::new();
     // The PATH of a user often lacks the folder of `ip`.
     for program in ["ip", "/usr/sbin/ip", "/sbin/ip"] {
@@ -41,7 +39,8 @@ pub(super) fn all() -> Result<Vec<Link>, Missing> {
             Err(error) => last = error,
         }
     }
-    Err(missing(format!("the program ip cannot list the CAN interfaces: {last}")))
+    let what = format!("the program ip cannot list the CAN interfaces: {last}");
+    Err(Missing { what, advice: "install iproute2, whose program ip sets up CAN interfaces" })
 }
 
 /// The interface with this name.

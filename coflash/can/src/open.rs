@@ -26,7 +26,7 @@ pub fn check(url: &str) -> Result<(), AdapterError> {
     target(url).map(|_| ())
 }
 
-fn target(url: &str) -> Result<Target, AdapterError> {
+pub(super) fn target(url: &str) -> Result<Target, AdapterError> {
     Target::parse(url).map_err(|why| AdapterError::Url { url: url.to_string(), why })
 }
 
@@ -48,7 +48,7 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Sen
             let driver = driver(kind).map_err(|why| bad(&why))?;
             (driver.open)(&which, rate.or(bit_rate).ok_or_else(needed)?)?
         }
-        Target::Gateway => {
+        Target::Gateway { .. } => {
             return Err(bad("a gateway carries only SDO, and this command needs the CAN bus itself"))
         }
     })

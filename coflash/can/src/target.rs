@@ -18,8 +18,8 @@ pub(super) enum Target {
     SocketCan { interface: String },
     /// An adapter with a driver of its own: which one of this kind.
     Driver { kind: Kind, which: String, rate: Option<u32> },
-    /// A gateway, which is not an adapter.
-    Gateway,
+    /// A network of a gateway, which is not an adapter.
+    Gateway { server: String, network: u16 },
 }
 
 impl Target {
@@ -67,7 +67,16 @@ impl Target {
             "peak" => with_driver(Kind::Peak, rest),
             "kvaser" => with_driver(Kind::Kvaser, rest),
             "gs_usb" => with_driver(Kind::GsUsb, rest),
-            "cia309" => Ok(Self::Gateway),
+            "cia309" => {
+                const FORM: &str = "it must be cia309://HOST:PORT/NET";
+                let rest = rest.strip_prefix("//").ok_or(FORM)?;
+                let (server, network) = rest.split_once('/').unwrap_or((rest, "1"));
+                let digits = network.bytes().all(|digit| digit.is_ascii_digit());
+                let network = network.parse().ok().filter(|_| digits);
+                let network = network.ok_or("its network must be a number from 0 to 65535");
+                let server = word(server).then(|| server.to_string()).ok_or(FORM)?;
+                Ok(Self::Gateway { server, network: network? })
+            }
             // A Windows drive is not a port, but users often write COM7: for a port.
             scheme if is_port(scheme) => Err(no_scheme(url.trim_end_matches(':'))),
             scheme => {
@@ -208,7 +217,8 @@ mod tests {
             ("slcan:COM7@500k", Target::SlcanPort { port: "COM7".to_string(), rate }),
             ("slcan:/dev/ttyACM0", Target::SlcanPort { port: "/dev/ttyACM0".to_string(), rate: None }),
             ("slcan:tcp://[::1]:7@500000", Target::SlcanTcp { server: "[::1]:7".to_string(), rate }),
-            ("cia309://host/1", Target::Gateway),
+            ("cia309://host:7", Target::Gateway { server: "host:7".to_string(), network: 1 }),
+            ("cia309://host/65535", Target::Gateway { server: "host".to_string(), network: 65535 }),
         ] {
             assert_eq!(Target::parse(url), Ok(target), "{url}");
         }
@@ -246,6 +256,11 @@ mod tests {
             ("pcan:PCAN_USBBUS1", "did you mean peak:PCAN_USBBUS1?"),
             ("SLCAN:COM7", "did you mean slcan:COM7?"),
             ("socketcand://host/can0@500k", "the server sets the bit rate"),
+            ("cia309:host/1", "must be cia309://HOST:PORT/NET"),
+            ("cia309:///1", "must be cia309://HOST:PORT/NET"),
+            ("cia309://host/net", "its network must be a number"),
+            ("cia309://host/+1", "its network must be a number"),
+            ("cia309://host/65536", "its network must be a number"),
         ] {
             let why = Target::parse(url).unwrap_err();
             assert!(why.contains(words), "{url}: {why}");

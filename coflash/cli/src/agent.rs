@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_agent::{run, Buses, Config, Ended, Kind, Options, Said};
+use coflash_agent::{run, Buses, Config, Ended, Kind, Options, Message};
 use coflash_core::device::legacy;
 use coflash_core::file::limit::read_text;
 use serde_json::json;
@@ -48,7 +48,7 @@ impl Agent {
         // Without random numbers the devices of several agents may ask at the same time.
         let seed = getrandom::u64().unwrap_or_default();
         let options = Options::default().once(self.once).seed(seed).cancelled(cancelled.clone());
-        let tell = |said: &Said| show(context, said);
+        let tell = |said: &Message| show(context, said);
         let count = config.targets.len();
         let noun = if count == 1 { "target" } else { "targets" };
         context.out.say(format_args!("{count} {noun}  (Ctrl-C ends it)"));
@@ -72,8 +72,8 @@ impl Agent {
 }
 
 /// Shows a message: a line for people, or an event.
-fn show(context: &Context, said: &Said) {
-    let Said { controller, kind, text, .. } = said;
+fn show(context: &Context, said: &Message) {
+    let Message { controller, kind, text, .. } = said;
     if let Some(update) = &said.update {
         record::failed(update, &[("controller", controller)]);
     }

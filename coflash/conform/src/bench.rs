@@ -287,7 +287,7 @@ impl<'a> Bench<'a> {
 
     /// Sends an SDO request and returns the answer.
     pub(super) fn ask(&mut self, data: [u8; 8]) -> Result<[u8; 8], Stop> {
-        self.tell(data)?;
+        self.send_sdo(data)?;
         let answer = self.heard()?;
         if ends(data[0], answer[0]) {
             self.at = NONE;
@@ -296,7 +296,7 @@ impl<'a> Bench<'a> {
     }
 
     /// Sends a frame of the SDO client that has no answer.
-    pub(super) fn tell(&mut self, data: [u8; 8]) -> Result<(), Stop> {
+    pub(super) fn send_sdo(&mut self, data: [u8; 8]) -> Result<(), Stop> {
         if initiates(data[0]) {
             self.at = [data[1], data[2], data[3]];
         } else if matches!(data[0], 0x80 | 0xA1) {
@@ -307,7 +307,7 @@ impl<'a> Bench<'a> {
 
     /// Aborts the transfer of an object.
     pub(super) fn abort(&mut self, index: u16, sub: u8) -> Result<(), Stop> {
-        self.tell(request(0x80, index, sub, 0x0800_0000_u32.to_le_bytes()))
+        self.send_sdo(request(0x80, index, sub, 0x0800_0000_u32.to_le_bytes()))
     }
 
     /// Sends an SDO request and expects an answer with this command byte.

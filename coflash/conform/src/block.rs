@@ -49,7 +49,7 @@ pub(super) const CHECKS: &[Check] = &[
         start(b, true, 127)?;
         let first = sub_block(b, 127)?;
         // The sub-block is lost as a whole.
-        b.tell(acknowledge(0, 127))?;
+        b.send_sdo(acknowledge(0, 127))?;
         ensure!(sub_block(b, 127)? == first, "other segments came");
         Ok(())
     }),
@@ -57,7 +57,7 @@ pub(super) const CHECKS: &[Check] = &[
         start(b, true, 127)?;
         let first = sub_block(b, 127)?;
         need!(first.len() >= 2, "1008h has one segment");
-        b.tell(acknowledge(1, 127))?;
+        b.send_sdo(acknowledge(1, 127))?;
         let rest = sub_block(b, 127)?;
         ensure!(rest[..] == first[1..], "{} of {} segments came again", rest.len(), first.len() - 1);
         Ok(())
@@ -124,7 +124,7 @@ fn start(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<bool, Stop> {
     let command = if crc { 0xA4 } else { 0xA0 };
     let answer = b.ask(initiate(command, 0, 0x1008, block_size, 0))?;
     ensure!(answer[0] & 0xF9 == 0xC0, "command byte {:02X}h to the initiate", answer[0]);
-    b.tell(START)?;
+    b.send_sdo(START)?;
     Ok(answer[0] & 4 != 0)
 }
 
@@ -164,7 +164,7 @@ fn whole(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<(), Stop> {
         got.extend(segments.concat());
         let last = acknowledge(segments.len() as u8, block_size);
         if left > 0 {
-            b.tell(last)?;
+            b.send_sdo(last)?;
             continue;
         }
         let end = b.ask(last)?;
@@ -176,6 +176,6 @@ fn whole(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<(), Stop> {
         let right = Crc::<u16>::new(&CRC_16_XMODEM).checksum(&got);
         ensure!(!crc || !sends_crc || told == right, "CRC {told:04X}h in place of {right:04X}h");
     }
-    b.tell([0xA1, 0, 0, 0, 0, 0, 0, 0])?;
+    b.send_sdo([0xA1, 0, 0, 0, 0, 0, 0, 0])?;
     b.works()
 }

@@ -62,7 +62,7 @@ pub fn checks() -> Vec<Check> {
     .concat()
 }
 
-/// Runs checks on a device and passes each verdict to `tell`. Before each check, the device is put
+/// Runs checks on a device and passes each verdict to `report`. Before each check, the device is put
 /// into pre-operational state, and a transfer that is left over is aborted. At the end, also after
 /// an error, the device gets back the NMT state that its heartbeat reported before the first check;
 /// without a heartbeat it stays pre-operational.
@@ -75,7 +75,7 @@ pub fn run(
     checks: &[Check],
     means: Means<'_>,
     cancelled: &Arc<AtomicBool>,
-    tell: &mut dyn FnMut(&Verdict),
+    report: &mut dyn FnMut(&Verdict),
 ) -> Result<Vec<Verdict>, Error> {
     let mut bench = Bench::new(adapter, node, means, cancelled);
     let found = match bench.state() {
@@ -83,7 +83,7 @@ pub fn run(
         Err(Stop::Bus(error)) => return Err(error),
         Err(_) => None,
     };
-    let verdicts = run_all(&mut bench, checks, tell);
+    let verdicts = run_all(&mut bench, checks, report);
     let left = bench.leave(found);
     // The reason why the checks ended stays the error.
     let verdicts = verdicts?;
@@ -93,7 +93,7 @@ pub fn run(
 fn run_all(
     bench: &mut Bench<'_>,
     checks: &[Check],
-    tell: &mut dyn FnMut(&Verdict),
+    report: &mut dyn FnMut(&Verdict),
 ) -> Result<Vec<Verdict>, Error> {
     let mut verdicts = Vec::new();
     for check in checks {
@@ -105,7 +105,7 @@ fn run_all(
             Err(Stop::Bus(error)) => return Err(error),
         };
         let verdict = Verdict { check: *check, outcome };
-        tell(&verdict);
+        report(&verdict);
         verdicts.push(verdict);
     }
     Ok(verdicts)

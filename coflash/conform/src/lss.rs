@@ -63,12 +63,12 @@ pub(super) const CHECKS: &[Check] = &[
     }),
     check("LSS-013", "switch state global to waiting ends the configuration state", SWITCH, |b| {
         select(b)?;
-        tell(b, &[0x04, 0])?;
+        send(b, &[0x04, 0])?;
         waits(b)
     }),
     check("LSS-014", "switch state global to a state that does not exist is ignored", SWITCH, |b| {
         select(b)?;
-        tell(b, &[0x04, 2])?;
+        send(b, &[0x04, 2])?;
         inquires_node(b)
     }),
     check("LSS-015", "node-ID 0 is refused with error 1", CONFIGURE, |b| refuses(b, &[0x11, 0])),
@@ -147,18 +147,18 @@ fn fastscan(value: u32, field: u8, next: u8) -> [u8; 8] {
     [0x51, a, b, c, d, 0, field, next]
 }
 
-fn tell(b: &mut Bench<'_>, data: &[u8]) -> Result<(), Stop> {
+fn send(b: &mut Bench<'_>, data: &[u8]) -> Result<(), Stop> {
     b.send(&Frame::full(CobId::LSS_REQUEST, padded(data)))
 }
 
 fn ask(b: &mut Bench<'_>, data: &[u8]) -> Result<Option<[u8; 8]>, Stop> {
-    tell(b, data)?;
+    send(b, data)?;
     Ok(b.hear(CobId::LSS_RESPONSE, LIMIT)?.and_then(|frame| frame.exactly().copied()))
 }
 
 /// The answers of all devices.
 fn ask_all(b: &mut Bench<'_>, data: &[u8]) -> Result<Vec<[u8; 8]>, Stop> {
-    tell(b, data)?;
+    send(b, data)?;
     let frames = b.hear_all(CobId::LSS_RESPONSE, LIMIT)?;
     Ok(frames.iter().filter_map(|frame| frame.exactly().copied()).collect())
 }
@@ -191,7 +191,7 @@ fn switch(address: [u32; 4]) -> [[u8; 5]; 4] {
 /// Switches the devices with this LSS address to configuration state; returns their answers.
 fn switch_all(b: &mut Bench<'_>, address: [u32; 4]) -> Result<Vec<[u8; 8]>, Stop> {
     let [vendor, product, revision, serial] = switch(address);
-    [vendor, product, revision].iter().try_for_each(|frame| tell(b, frame))?;
+    [vendor, product, revision].iter().try_for_each(|frame| send(b, frame))?;
     ask_all(b, &serial)
 }
 
@@ -222,7 +222,7 @@ fn configured(b: &mut Bench<'_>) -> Result<Holders, Stop> {
 fn holders(b: &mut Bench<'_>, address: [u32; 4]) -> Result<Holders, Stop> {
     switch_all(b, address)?;
     let holders = configured(b)?;
-    tell(b, &[0x04, 0])?;
+    send(b, &[0x04, 0])?;
     Ok(holders)
 }
 
@@ -232,7 +232,7 @@ fn is_other(b: &mut Bench<'_>, id: u8) -> Result<bool, Stop> {
         Some(node) => Ok(node != b.node && b.reaches(node)?),
         // LSS identify non-configured remote slave, in waiting state.
         None if id == NO_NODE => {
-            tell(b, &[0x04, 0])?;
+            send(b, &[0x04, 0])?;
             Ok(ask_all(b, &[0x4C])?.iter().any(|answer| answer[0] == 0x50))
         }
         None => Ok(false),
@@ -256,7 +256,7 @@ fn has_lss(b: &mut Bench<'_>) -> Result<(), Stop> {
         }
     };
     match judged {
-        Ok(()) => tell(b, &[0x04, 0]),
+        Ok(()) => send(b, &[0x04, 0]),
         Err(why) => skipped(why),
     }
 }
@@ -296,7 +296,7 @@ fn waits(b: &mut Bench<'_>) -> Result<(), Stop> {
 
 fn select(b: &mut Bench<'_>) -> Result<(), Stop> {
     let [vendor, product, revision, serial] = switch(identity(b)?);
-    [vendor, product, revision].iter().try_for_each(|frame| tell(b, frame))?;
+    [vendor, product, revision].iter().try_for_each(|frame| send(b, frame))?;
     match ask(b, &serial)? {
         Some([0x44, ..]) => Ok(()),
         other => failed(format!("the switch was answered with {other:02X?}")),
@@ -315,7 +315,7 @@ fn selects_nothing(b: &mut Bench<'_>, field: usize) -> Result<(), Stop> {
             return b.works();
         }
         // Another device has this address.
-        tell(b, &[0x04, 0])?;
+        send(b, &[0x04, 0])?;
     }
     skipped("other devices have the altered LSS addresses")
 }
@@ -349,7 +349,7 @@ fn identify(b: &mut Bench<'_>, address: [u32; 4]) -> Result<Vec<[u8; 8]>, Stop> 
     let [vendor, product, revision, serial] = address;
     for (command, value) in (0x46_u8..).zip([vendor, product, revision, revision, serial]) {
         let [a, c, d, e] = value.to_le_bytes();
-        tell(b, &[command, a, c, d, e])?;
+        send(b, &[command, a, c, d, e])?;
     }
     let [a, c, d, e] = serial.to_le_bytes();
     ask_all(b, &[0x4B, a, c, d, e])

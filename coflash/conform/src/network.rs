@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::nmt::{NmtCommand, NmtState};
 use canopen::{CobId, Frame};
 
-use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::bench::{abort_of, failed, need, request, skipped, Bench, Stop};
 use super::check::Check;
 use super::frames::{no_boot_up, REACTION};
 
@@ -40,7 +40,7 @@ pub(super) const CHECKS: &[Check] = &[
     })
     .that_resets(),
     Check::new("HB-001", "the heartbeat is one byte and tells pre-operational", HEARTBEAT, |b| {
-        tells(b, NmtState::PreOperational)
+        reports(b, NmtState::PreOperational)
     }),
     Check::new("HB-002", "five heartbeats in 4 times 1017h, within 25 %", HEARTBEAT, |b| {
         let (id, period) = heartbeat(b)?;
@@ -97,12 +97,12 @@ pub(super) const CHECKS: &[Check] = &[
     .needs(has_heartbeat_time),
     Check::new("NMT-001", "start: the heartbeat tells operational", NMT, |b| {
         b.send(&NmtCommand::Start.emit(Some(b.node)))?;
-        tells(b, NmtState::Operational)
+        reports(b, NmtState::Operational)
     })
     .needs(has_states),
     Check::new("NMT-002", "stop: the heartbeat tells stopped", NMT, |b| {
         b.send(&NmtCommand::Stop.emit(Some(b.node)))?;
-        tells(b, NmtState::Stopped)
+        reports(b, NmtState::Stopped)
     })
     .needs(has_states),
     Check::new("NMT-003", "stopped: no SDO is answered", "CiA 301 4.2, NMT state machine", |b| {
@@ -124,13 +124,13 @@ pub(super) const CHECKS: &[Check] = &[
             let node = b.node.get();
             no_boot_up(b, &Frame::of(CobId::NMT, &[command, node]))?;
         }
-        tells(b, NmtState::PreOperational)
+        reports(b, NmtState::PreOperational)
     }),
     Check::new("NMT-006", "enter pre-operational is obeyed in operational state", NMT, |b| {
         b.send(&NmtCommand::Start.emit(Some(b.node)))?;
-        tells(b, NmtState::Operational)?;
+        reports(b, NmtState::Operational)?;
         b.send(&NmtCommand::EnterPreOperational.emit(Some(b.node)))?;
-        tells(b, NmtState::PreOperational)
+        reports(b, NmtState::PreOperational)
     })
     .needs(has_states),
 ];
@@ -142,20 +142,15 @@ fn has_heartbeat_time(b: &mut Bench<'_>) -> Result<(), Stop> {
 
 /// Opens a segmented upload of 1008h.
 fn opens_transfer(b: &mut Bench<'_>) -> Result<(), Stop> {
-    if b.ask(request(0x40, 0x1008, 0, [0; 4]))?[0] & 0xE2 == 0x40 {
-        Ok(())
-    } else {
-        skipped("1008h does not come in segments")
-    }
+    let answer = b.ask(request(0x40, 0x1008, 0, [0; 4]))?;
+    need!(answer[0] & 0xE2 == 0x40, "1008h does not come in segments");
+    Ok(())
 }
 
 /// A bootloader, by 1000h, has nothing to operate: it may stay in pre-operational state.
 fn has_states(b: &mut Bench<'_>) -> Result<(), Stop> {
-    if b.value(0x1000, 0, 4)? == super::program::BOOTLOADER {
-        skipped("a bootloader stays pre-operational")
-    } else {
-        Ok(())
-    }
+    need!(b.value(0x1000, 0, 4)? != super::program::BOOTLOADER, "a bootloader stays pre-operational");
+    Ok(())
 }
 
 pub(super) fn boots(b: &mut Bench<'_>, command: NmtCommand) -> Result<(), Stop> {
@@ -188,7 +183,7 @@ fn next(b: &mut Bench<'_>, id: CobId, period: Duration) -> Result<Frame, Stop> {
 }
 
 /// Expects the state in the second heartbeat from now: the first may have been on its way.
-fn tells(b: &mut Bench<'_>, state: NmtState) -> Result<(), Stop> {
+fn reports(b: &mut Bench<'_>, state: NmtState) -> Result<(), Stop> {
     let id = CobId::heartbeat(b.node);
     let mut frame = None;
     for _ in 0..2 {

@@ -119,7 +119,7 @@ pub(super) const CHECKS: &[Check] = &[
     }),
     check("PRG-031", "block download, the second segment missing: the first alone is acknowledged", BLOCK, |b| {
         begin_download(b, 0xC6, 0x1F50, 28)?;
-        b.tell([1, 99, 0, 0, 0, 0, 0, 0])?;
+        b.send_sdo([1, 99, 0, 0, 0, 0, 0, 0])?;
         let answer = b.takes([0x80 | 3, 0, 0, 0, 0, 0, 0, 0], 0xA2)?;
         b.abort(0x1F50, 1)?;
         ensure!(answer[1] == 1, "{} is acknowledged", answer[1]);

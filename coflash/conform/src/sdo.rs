@@ -195,9 +195,6 @@ pub(super) fn text(b: &mut Bench<'_>, index: u16) -> Result<Vec<u8>, Stop> {
             "segment {number}: the bit for the last segment is wrong"
         );
     }
-    if got.len() == size {
-        Ok(got)
-    } else {
-        failed(format!("{} bytes came, {size} were told", got.len()))
-    }
+    ensure!(got.len() == size, "{} bytes came, {size} were told", got.len());
+    Ok(got)
 }

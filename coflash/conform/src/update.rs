@@ -43,7 +43,7 @@ pub(super) const CHECKS: &[Check] = &[
     check("UPD-004", "the call is heard after other requests", COMMANDS, |b| {
         running(b)?;
         for _ in 0..LOAD {
-            b.tell(request(0x40, 0x1000, 0, [0; 4]))?;
+            b.send_sdo(request(0x40, 0x1000, 0, [0; 4]))?;
         }
         b.with(steps::call_back).map(drop)
     }),

@@ -6,7 +6,6 @@
 //! by the time-out of its connection.
 
 use std::convert::Infallible;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +13,7 @@ use axum::response::sse::{Event, Sse};
 use coboot_can::wall;
 use futures_util::stream::{self, Stream};
 use serde_json::{json, Value};
-use tokio::sync::watch;
+use tokio::sync::{watch, OwnedSemaphorePermit, Semaphore};
 use tokio::time::sleep;
 
 use super::shared::{lock, Shared};
@@ -27,22 +26,20 @@ const BEAT: Duration = Duration::from_secs(1);
 /// The most readers at the same time.
 const READERS: usize = 32;
 
-/// The number of readers.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Readers(Arc<AtomicUsize>);
+/// The places of the readers.
+#[derive(Clone, Debug)]
+pub(super) struct Readers(Arc<Semaphore>);
 
-impl Readers {
-    pub(super) fn count(&self) -> usize {
-        self.0.load(Ordering::Relaxed)
+impl Default for Readers {
+    fn default() -> Self {
+        Self(Arc::new(Semaphore::new(READERS)))
     }
 }
 
-/// The place of one reader; dropping it frees the place.
-struct Place(Readers);
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        self.0 .0.fetch_sub(1, Ordering::Relaxed);
+impl Readers {
+    /// The number of readers.
+    pub(super) fn count(&self) -> usize {
+        READERS - self.0.available_permits()
     }
 }
 
@@ -60,7 +57,7 @@ struct Reader {
     second: u64,
     /// The version of the state that was sent to this reader; 0 for none.
     version: u64,
-    _place: Place,
+    _place: OwnedSemaphorePermit,
 }
 
 /// A stream for one more reader; `None` if there are too many.
@@ -70,11 +67,7 @@ pub(super) fn stream(
     readers: &Readers,
     frames: bool,
 ) -> Option<Sse<impl Stream<Item = Result<Event, Infallible>>>> {
-    let before = readers.0.fetch_add(1, Ordering::Relaxed);
-    let place = Place(readers.clone());
-    if before >= READERS {
-        return None;
-    }
+    let place = readers.0.clone().try_acquire_owned().ok()?;
     let reader = Reader {
         changed: shared.changed.subscribe(),
         arrived: shared.arrived.subscribe(),
@@ -108,7 +101,7 @@ impl Reader {
         let version = *self.changed.borrow_and_update();
         if version != self.version {
             self.version = version;
-            value["state"] = self.shared.look(|state| (self.view)(state));
+            value["state"] = self.shared.read(|state| (self.view)(state));
         }
         let now = wall().as_secs();
         let frames = lock(&self.shared.frames);

@@ -221,7 +221,7 @@ async fn trace(State(site): State<Site>) -> Response {
 
 async fn readback(State(site): State<Site>) -> Answer {
     let bytes = lock(&site.shared.readback).clone();
-    let shown = site.shared.look(|state| state.readback.clone());
+    let shown = site.shared.read(|state| state.readback.clone());
     let (Some(bytes), Some(shown)) = (bytes, shown) else {
         return Err(Refused::new(StatusCode::NOT_FOUND, "no program was read", "read one first"));
     };
@@ -236,7 +236,7 @@ pub(super) struct Open {
 
 /// Refuses to change the adapter during a task.
 pub(super) fn idle(site: &Site) -> Result<(), Refused> {
-    match site.shared.look(|state| state.task.as_ref().map(|task| task.words.clone())) {
+    match site.shared.read(|state| state.task.as_ref().map(|task| task.words.clone())) {
         Some(words) => Err(Refusal::Busy(words).into()),
         None => Ok(()),
     }
@@ -280,7 +280,7 @@ impl FromRequest<Site> for Sent {
 
 async fn take_file(State(site): State<Site>, Sent { name, upload }: Sent) -> Answer {
     let Upload { bytes, room } = upload;
-    let settings = site.shared.look(|state| state.settings.clone());
+    let settings = site.shared.read(|state| state.settings.clone());
     let answer = load(&site, Arc::new(bytes), name, settings).await;
     drop(room);
     answer
@@ -328,7 +328,7 @@ async fn take_board(State(site): State<Site>, Sent { name, upload }: Sent) -> An
         )
     })?;
     lock(&site.own_boards).push(layout);
-    let program = site.shared.look(|state| state.settings.program);
+    let program = site.shared.read(|state| state.settings.program);
     choose(&site, Settings { board: Some(layout), program }).await
 }
 
@@ -434,7 +434,7 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
     if wanted.is_empty() {
         return Err(bad("no device is chosen", "choose one in the table"));
     }
-    let (program, misfit) = site.shared.look(|state| {
+    let (program, misfit) = site.shared.read(|state| {
         let devices = state.devices.iter().flat_map(|devices| devices.values());
         let misfit =
             devices.filter(|device| wanted.iter().any(|node| node.get() == device.node)).find_map(|device| {
@@ -491,7 +491,7 @@ async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
         return Err(bad("neither a node-ID nor a bit rate is given", "give one of them"));
     }
     if let Some(node) = node {
-        let taken = site.shared.look(|state| {
+        let taken = site.shared.read(|state| {
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
             (device.answers && device.identity != identity).then_some(())
         });

@@ -33,7 +33,7 @@ const CONNECTIONS: usize = 64;
 /// The send buffer of a connection, which limits the data for a slow reader.
 const SEND_BUFFER: u32 = 128 * 1024;
 /// How often the server checks whether it must end.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL: Duration = Duration::from_millis(100);
 /// How long a cancelled task may take to end.
 const IN_ORDER: Duration = Duration::from_secs(10);
 
@@ -169,7 +169,7 @@ impl Server {
             end_in_order(&shared).await
         });
         // The adapter is closed normally; a thread that hangs in a task is abandoned.
-        if shared.order(Order::End).is_ok() && shared.look(|state| state.task.is_none()) {
+        if shared.order(Order::End).is_ok() && shared.read(|state| state.task.is_none()) {
             let _ = worker.join();
         }
         let unsaved = at_end.and_then(|at_end| at_end.save());
@@ -180,19 +180,19 @@ impl Server {
 
 /// Cancels the running task, and returns the state of an update's devices.
 async fn end_in_order(shared: &Shared) -> Option<String> {
-    let busy = || shared.look(|state| state.task.is_some());
+    let busy = || shared.read(|state| state.task.is_some());
     if !busy() {
         return None;
     }
     shared.cancel();
     let ended = async {
         while busy() {
-            tokio::time::sleep(LOOK).await;
+            tokio::time::sleep(POLL).await;
         }
     };
     // A task that does not react is abandoned.
     let _ = tokio::time::timeout(IN_ORDER, ended).await;
-    let words = shared.look(|state| {
+    let words = shared.read(|state| {
         let devices = state.updates.iter().map(|update| format!("node {}: {}", update.node, update.words));
         devices.collect::<Vec<_>>().join("\n")
     });
@@ -202,7 +202,7 @@ async fn end_in_order(shared: &Shared) -> Option<String> {
 /// Returns when the flag is set.
 async fn set(flag: &AtomicBool) {
     while !flag.load(Ordering::Relaxed) {
-        tokio::time::sleep(LOOK).await;
+        tokio::time::sleep(POLL).await;
     }
 }
 
@@ -220,7 +220,7 @@ async fn accept(listener: TcpListener, app: axum::Router, times: Times) {
     loop {
         let Ok((stream, _)) = listener.accept().await else {
             // The error may be temporary, for example if no descriptor is free.
-            tokio::time::sleep(LOOK).await;
+            tokio::time::sleep(POLL).await;
             continue;
         };
         if places.available_permits() == 0 {

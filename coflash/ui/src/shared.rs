@@ -114,16 +114,16 @@ impl Shared {
     }
 
     /// Remembers an event of an update, and reports the update if it has failed.
-    pub(super) fn told(&self, node: NodeId, event: &Event) {
-        let failed = lock(&self.frames).told(node, event);
+    pub(super) fn record(&self, node: NodeId, event: &Event) {
+        let failed = lock(&self.frames).record(node, event);
         if let Some(update) = failed {
             (self.failed.0)(&update);
         }
     }
 
     /// Reads the state.
-    pub(super) fn look<R>(&self, look: impl FnOnce(&State) -> R) -> R {
-        look(&lock(&self.state))
+    pub(super) fn read<R>(&self, read: impl FnOnce(&State) -> R) -> R {
+        read(&lock(&self.state))
     }
 
     /// Starts a task if no other one is running.

@@ -288,7 +288,7 @@ impl State {
     }
 
     /// Updates one device.
-    pub(super) fn told(&mut self, info: &DeviceInfo) {
+    pub(super) fn update_device(&mut self, info: &DeviceInfo) {
         let devices = self.devices.get_or_insert_default();
         let heartbeat = devices.get(&info.node.get()).and_then(|device| device.heartbeat);
         devices.insert(info.node.get(), Device { heartbeat, ..Device::of(info) });

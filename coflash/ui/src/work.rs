@@ -71,11 +71,11 @@ fn session<'l>(link: &'l mut Link, shared: &Shared, node: NodeId) -> Session<'l>
 
 /// Reads a device again, so that the table is right. An error here does not change the result of
 /// the previous task.
-fn look_again(link: &mut Link, shared: &Shared, node: NodeId) {
+fn read_again(link: &mut Link, shared: &Shared, node: NodeId) {
     let mut session = Session::on(link, node, Timing::default().boot(Duration::from_secs(1)));
     let told = info(&mut session);
     shared.change(|state| match told {
-        Ok(info) => state.told(&info),
+        Ok(info) => state.update_device(&info),
         Err(_) => state.silent(node),
     });
 }
@@ -83,7 +83,7 @@ fn look_again(link: &mut Link, shared: &Shared, node: NodeId) {
 fn step_of(link: &mut Link, shared: &Shared, node: NodeId, number: u8, step: Step) -> Result<Notice, Error> {
     let done = single(&mut session(link, shared, node), shared, number, step);
     if !matches!(done, Err(Error::Adapter(_))) {
-        look_again(link, shared, node);
+        read_again(link, shared, node);
     }
     done
 }
@@ -151,7 +151,7 @@ fn update_all(
     let many = ManyOptions::default().at_once(AT_ONCE).cancelled(shared.cancelled.clone());
     let tell = |number: usize, event: Event| {
         if let Some(job) = jobs.get(number) {
-            shared.told(job.node, &event);
+            shared.record(job.node, &event);
         }
         shared.change(|state| {
             if let Some(update) = state.updates.get_mut(number) {
@@ -183,7 +183,7 @@ fn update_all(
     });
     let lost = |result: &Result<_, Failed>| matches!(result, Err(Failed { error: Error::Adapter(_), .. }));
     if !results.iter().any(lost) {
-        nodes.iter().for_each(|node| look_again(link, shared, *node));
+        nodes.iter().for_each(|node| read_again(link, shared, *node));
     }
     report(shared, nodes, file, options.program, &results, wall().saturating_sub(began));
     let good = results.len() - failed;
@@ -198,7 +198,7 @@ fn update_all(
 
 /// Adds the check that the device is the target of the file, if both give their identity.
 fn for_node(shared: &Shared, file: &Loaded, node: NodeId, options: FlashOptions) -> FlashOptions {
-    let told = shared.look(|state| {
+    let told = shared.read(|state| {
         let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
         device.product()
     });
@@ -316,7 +316,7 @@ fn assign(
         .push(if store { "stored" } else { "not stored: the setting is lost at the next start" }.to_string());
     shared.change(|state| state.lss = None);
     if let Some(node) = node {
-        look_again(link, shared, node);
+        read_again(link, shared, node);
     }
     Ok(Notice::done(words.join("; ")))
 }

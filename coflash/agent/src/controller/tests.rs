@@ -623,10 +623,10 @@ fn attributes_are_sent_when_the_server_asks_and_the_device_answers() {
     assert_eq!(drive.next(), Step::AskDevice);
     // The device takes its time: other steps go on, and it is not asked twice.
     drive.poll(&[("configData", "/x")]);
-    drive.controller.looked(Err("node 5 does not answer".into()));
+    drive.controller.device_answered(Err("node 5 does not answer".into()));
     drive.poll(&[("configData", "/x")]);
     assert_eq!(drive.next(), Step::AskDevice);
-    drive.controller.looked(Ok(vec![("software".into(), "1.0.0".into())]));
+    drive.controller.device_answered(Ok(vec![("software".into(), "1.0.0".into())]));
     let Request::Put(path, body) = drive.asks() else { panic!() };
     assert_eq!((path.as_str(), &body["data"]["software"]), ("configData", &json!("1.0.0")));
     drive.answer(200, &json!({}));
@@ -720,7 +720,7 @@ fn no_course_of_answers_brings_it_out_of_step() {
                         }
                         1 if flashing.is_some() => drive.controller.news(News::Kept),
                         2 if looking => {
-                            drive.controller.looked(Ok(vec![]));
+                            drive.controller.device_answered(Ok(vec![]));
                             looking = false;
                         }
                         3 => drive = drive.restarted(),

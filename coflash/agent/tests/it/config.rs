@@ -1,6 +1,6 @@
 //! The example of the documentation is a configuration.
 
-use coflash_agent::{Config, What};
+use coflash_agent::{Config, TargetKind};
 use coflash_core::file::sealed::SigningKey;
 use kit::folder::Folder;
 
@@ -18,7 +18,8 @@ fn the_pages_example_is_a_configuration() {
         .unwrap();
     match Config::parse(&without_variable, &folder, None, None) {
         Ok(config) => {
-            let machines = config.targets.iter().filter(|target| matches!(target.what, What::Machine(_)));
+            let machines =
+                config.targets.iter().filter(|target| matches!(target.what, TargetKind::Machine(_)));
             assert_eq!((config.targets.len(), machines.count()), (4, 1));
         }
         // The example's server is at https://.

@@ -19,7 +19,7 @@ use std::thread;
 use std::time::Duration;
 
 use coflash_agent::{
-    run, Config, Content, Devices, Ended, Flashed, News, Options, Order, Said, Target, Times, What,
+    run, Config, Content, Devices, Ended, Flashed, Message, News, Options, Order, Target, TargetKind, Times,
 };
 use coflash_core::file::block_file;
 use coflash_core::update::Payload;
@@ -47,8 +47,8 @@ impl Fake {
 }
 
 impl Devices for Fake {
-    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
-        let What::Device(device) = &target.what else { return Ok(Vec::new()) };
+    fn attributes(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
+        let TargetKind::Device(device) = &target.what else { return Ok(Vec::new()) };
         match self.silent {
             true => Err("it does not answer".to_string()),
             false => Ok(vec![("node".to_string(), device.node.to_string())]),
@@ -117,7 +117,7 @@ fn options() -> Options {
 /// Runs the agent until there is nothing to do; returns its end, and what it said.
 fn once(server: &Server, folder: &Folder, fake: &Fake, ids: &[&str]) -> (Ended, String) {
     let said = Mutex::new(String::new());
-    let tell = |message: &Said| {
+    let tell = |message: &Message| {
         *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);
     };
     let ended = run(&config(server, folder, ids), &options(), fake, &tell).unwrap();
@@ -303,7 +303,7 @@ fn a_wrong_token_is_said_and_not_shown() {
     );
     let config = Config::parse(&text, &folder, None, None).unwrap();
     let said = Mutex::new(String::new());
-    let tell = |message: &Said| *said.lock().unwrap() += &message.text;
+    let tell = |message: &Message| *said.lock().unwrap() += &message.text;
     let ended = run(&config, &options(), &fake, &tell).unwrap();
     let said = said.into_inner().unwrap();
     assert_eq!(ended.unserved, 1);
@@ -311,13 +311,13 @@ fn a_wrong_token_is_said_and_not_shown() {
 }
 
 /// Runs the agent in the background until the test has seen what it wants.
-fn while_it_runs(server: &Server, folder: &Folder, fake: &Fake, act: impl FnOnce()) {
+fn while_it_runs(server: &Server, folder: &Folder, fake: &Fake, act: impl FnOnce(&AtomicBool)) {
     let cancelled = Arc::new(AtomicBool::new(false));
     let options = options().once(false).cancelled(cancelled.clone());
     let config = config(server, folder, &[ID]);
     thread::scope(|scope| {
         let agent = scope.spawn(|| run(&config, &options, fake, &|_| {}).unwrap());
-        act();
+        act(&cancelled);
         cancelled.store(true, Ordering::Relaxed);
         agent.join().unwrap();
     });
@@ -329,7 +329,7 @@ fn a_cancellation_during_the_update_is_rejected_with_a_reason() {
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
-    while_it_runs(&server, &folder, &fake, || {
+    while_it_runs(&server, &folder, &fake, |_| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         server.state().targets.get_mut(ID).unwrap().action.as_mut().unwrap().cancelling = true;
         server.wait("a rejection", |state| !action(state).rejected.is_empty());
@@ -364,7 +364,7 @@ fn what_was_interrupted_goes_on_after_a_restart() {
     let (server, folder) = (Server::start(&[ID]), folder("restart"));
     server.assign(ID, Action::new(3, &file()));
     let fake = Fake { answers: Mutex::new(vec![Flashed::Interrupted]), ..Fake::default() };
-    while_it_runs(&server, &folder, &fake, || {
+    while_it_runs(&server, &folder, &fake, |_| {
         server.wait("the update", |_| !fake.given().is_empty());
     });
     // As after Ctrl-C: the server knows nothing of an end.
@@ -382,7 +382,7 @@ fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
-    while_it_runs(&server, &folder, &fake, || {
+    while_it_runs(&server, &folder, &fake, |_| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         server.fault("feedback", 1000, Fault::Status(500, None));
         busy.store(false, Ordering::Relaxed);
@@ -450,15 +450,10 @@ fn a_result_that_comes_while_the_agent_ends_is_kept() {
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
-    let cancelled = Arc::new(AtomicBool::new(false));
-    let endless = options().once(false).cancelled(cancelled.clone());
-    let config = config(&server, &folder, &[ID]);
-    thread::scope(|scope| {
-        let agent = scope.spawn(|| run(&config, &endless, &fake, &|_| {}).unwrap());
+    while_it_runs(&server, &folder, &fake, |cancelled| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         cancelled.store(true, Ordering::Relaxed);
         busy.store(false, Ordering::Relaxed);
-        agent.join().unwrap();
     });
     let (_, said) = once(&server, &folder, &fake, &[ID]);
     assert_eq!(server.action(ID).result.as_deref(), Some("success"), "{said}");
@@ -468,7 +463,7 @@ fn a_result_that_comes_while_the_agent_ends_is_kept() {
 #[test]
 fn two_agents_do_not_share_a_folder() {
     let (server, folder, fake) = (Server::start(&[ID]), folder("lock"), Fake::default());
-    while_it_runs(&server, &folder, &fake, || {
+    while_it_runs(&server, &folder, &fake, |_| {
         server.wait("a poll", |state| !state.seen.is_empty());
         let why = run(&config(&server, &folder, &[ID]), &options(), &fake, &|_| {}).unwrap_err();
         assert!(why.to_string().contains("another agent"), "{why}");
@@ -521,7 +516,7 @@ fn a_state_file_that_is_put_right_is_read_while_the_agent_runs() {
     let record = files.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
     std::fs::write(&record, "{").unwrap();
     server.assign(ID, Action::new(4, &file()));
-    while_it_runs(&server, &folder, &fake, || {
+    while_it_runs(&server, &folder, &fake, |_| {
         thread::sleep(Duration::from_millis(50));
         assert!(fake.given().is_empty());
         std::fs::remove_file(&record).unwrap();

@@ -1,7 +1,7 @@
 //! Packages for machines, from a server: what is taken, and from whom. Machines on a bus:
 //! sim/node/tests/it/agent.rs.
 
-use coflash_agent::{run, Config, Said};
+use coflash_agent::{run, Config, Message};
 use coflash_core::file::sealed::SigningKey;
 use coflash_core::machine::{make, Entry, Part};
 use kit::folder::Folder;
@@ -46,7 +46,7 @@ fn told(server: &Server, folder: &Folder, target: &str, action: Action) -> (Stri
     let config = Config::parse(&text, folder, None, None).unwrap();
     server.assign(ID, action);
     let fake = Fake::default();
-    run(&config, &options(), &fake, &|_: &Said| {}).unwrap();
+    run(&config, &options(), &fake, &|_: &Message| {}).unwrap();
     let action = server.action(ID);
     let details = format!("{}: {}", action.result.clone().unwrap_or_default(), action.details("closed"));
     (details, fake.given())

@@ -3,28 +3,14 @@
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
-use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
 use std::thread;
-use std::time::Duration;
 
-use coflash_agent::{run, Config, Devices, Ended, Flashed, News, Options, Order, Said, Target, Times};
+use coflash_agent::{run, Config, Ended, Message};
 use kit::hawkbit::{Action, Fault, File, Server};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
-
-struct Good;
-
-impl Devices for Good {
-    fn look(&self, _: &Target) -> Result<Vec<(String, String)>, String> {
-        Ok(Vec::new())
-    }
-
-    fn flash(&self, _: Order<'_>, _: Sender<News>) -> Flashed {
-        Flashed::Done(vec!["done".to_string()])
-    }
-}
 
 fn pem(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tls").join(name)
@@ -92,11 +78,9 @@ fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
          token-file = 'token'\n"
     );
     let config = Config::parse(&text, &folder, None, None).unwrap();
-    let ms = Duration::from_millis;
-    let times = Times::default().backoff_first(ms(10)).backoff_most(ms(40));
     let said = Mutex::new(String::new());
-    let tell = |message: &Said| *said.lock().unwrap() += &format!("{}\n", message.text);
-    let ended = run(&config, &Options::default().once(true).times(times), &Good, &tell).unwrap();
+    let tell = |message: &Message| *said.lock().unwrap() += &format!("{}\n", message.text);
+    let ended = run(&config, &crate::options(), &crate::Fake::default(), &tell).unwrap();
     (ended, said.into_inner().unwrap())
 }
 

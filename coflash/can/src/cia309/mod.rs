@@ -73,20 +73,6 @@ pub struct Cia309 {
     timeout: Option<Duration>,
 }
 
-/// `//HOST:PORT/NET`. NET is 1 if it is left out.
-pub(super) fn open(url: &str, rest: &str) -> Result<Cia309, AdapterError> {
-    let bad = |why: &str| AdapterError::Url { url: url.to_string(), why: why.to_string() };
-    let rest = rest.strip_prefix("//").ok_or_else(|| bad("it must be cia309://HOST:PORT/NET"))?;
-    let (server, network) = rest.split_once('/').unwrap_or((rest, "1"));
-    let graphic = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
-    if !graphic(server) {
-        return Err(bad("it must be cia309://HOST:PORT/NET"));
-    }
-    let digits = network.bytes().all(|digit| digit.is_ascii_digit());
-    let network = network.parse().ok().filter(|_| digits);
-    Cia309::connect(server, network.ok_or_else(|| bad("its network must be a number from 0 to 65535"))?)
-}
-
 impl Cia309 {
     /// Connects to a gateway at `host:port`.
     ///

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use canopen::Frame;
 
-use super::wire::{self, request, Constants, Said};
+use super::wire::{self, request, Constants, Transfer};
 use crate::driven::{Driver, Fault, Sent};
 use crate::health::Health;
 
@@ -71,17 +71,17 @@ impl<U: Usb> Driver for GsUsb<U> {
     fn receive(&mut self, wait: Duration) -> Result<Option<Frame>, Fault> {
         let Some(bytes) = self.usb.read(wait).map_err(Fault::Lost)? else { return Ok(None) };
         match wire::parse(&bytes, self.channel).map_err(|what| Fault::Nonsense(format!("it sends {what}")))? {
-            Said::Frame(frame) => Ok(Some(frame)),
+            Transfer::Frame(frame) => Ok(Some(frame)),
             // Ignore an echo that the device does not owe.
-            Said::Sent(echo) => {
+            Transfer::Sent(echo) => {
                 self.under_way.remove(&echo);
                 Ok(None)
             }
-            Said::Error(class, data) => {
+            Transfer::Error(class, data) => {
                 self.health.error_frame(class, &data);
                 Ok(None)
             }
-            Said::Other => Ok(None),
+            Transfer::Other => Ok(None),
         }
     }
 

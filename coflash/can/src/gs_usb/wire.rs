@@ -172,7 +172,7 @@ pub fn emit(frame: &Frame, channel: u8, echo: u32) -> [u8; FRAME] {
 
 /// A message from a device.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Said {
+pub enum Transfer {
     /// A frame came from the bus.
     Frame(Frame),
     /// The frame with this echo has been sent.
@@ -187,25 +187,25 @@ pub enum Said {
 ///
 /// # Errors
 /// What is wrong with the transfer.
-pub fn parse(bytes: &[u8], channel: u8) -> Result<Said, String> {
+pub fn parse(bytes: &[u8], channel: u8) -> Result<Transfer, String> {
     let short = || format!("a transfer of {} bytes", bytes.len());
     let (echo, id) = (word(bytes, 0).ok_or_else(short)?, word(bytes, 4).ok_or_else(short)?);
     let Some(&[dlc, of, flags, _, ref data @ ..]) = bytes.get(8..FRAME) else { return Err(short()) };
     if of != channel {
-        return Ok(Said::Other);
+        return Ok(Transfer::Other);
     }
     if echo != FROM_THE_BUS {
-        return Ok(Said::Sent(echo));
+        return Ok(Transfer::Sent(echo));
     }
     if flags & FLAG_FD != 0 {
-        return Ok(Said::Other);
+        return Ok(Transfer::Other);
     }
     if id & ERROR != 0 {
         let data = data.try_into().map_err(|_| short())?;
-        return Ok(Said::Error(id & 0x1FFF_FFFF, data));
+        return Ok(Transfer::Error(id & 0x1FFF_FFFF, data));
     }
     frame_of((id & 0x1FFF_FFFF).into(), id & EXTENDED != 0, id & REMOTE != 0, dlc.into(), data)
-        .map(Said::Frame)
+        .map(Transfer::Frame)
 }
 
 #[cfg(test)]
@@ -259,24 +259,24 @@ mod tests {
         let received =
             [0xFF, 0xFF, 0xFF, 0xFF, 0x85, 0x05, 0, 0, 8, 0, 0, 0, 0x43, 0x00, 0x10, 0x00, 0, 0, 0, 0x10];
         let answer = frame(0x585, &[0x43, 0x00, 0x10, 0x00, 0, 0, 0, 0x10]);
-        assert_eq!(parse(&received, 0), Ok(Said::Frame(answer)));
-        assert_eq!(parse(&received, 1), Ok(Said::Other));
+        assert_eq!(parse(&received, 0), Ok(Transfer::Frame(answer)));
+        assert_eq!(parse(&received, 1), Ok(Transfer::Other));
         // The same with a time stamp at the end.
-        assert_eq!(parse(&[&received[..], &[1, 2, 3, 4]].concat(), 0), Ok(Said::Frame(answer)));
+        assert_eq!(parse(&[&received[..], &[1, 2, 3, 4]].concat(), 0), Ok(Transfer::Frame(answer)));
         let mut echo = received;
         echo[..4].copy_from_slice(&[9, 0, 0, 0]);
-        assert_eq!(parse(&echo, 0), Ok(Said::Sent(9)));
+        assert_eq!(parse(&echo, 0), Ok(Transfer::Sent(9)));
         // CAN_ERR_FLAG and CAN_ERR_ACK.
         let error = [0xFF, 0xFF, 0xFF, 0xFF, 0x20, 0, 0, 0x20, 8, 0, 0, 0, 0, 0x20, 0, 0, 0, 0, 128, 0];
-        assert_eq!(parse(&error, 0), Ok(Said::Error(0x20, [0, 0x20, 0, 0, 0, 0, 128, 0])));
+        assert_eq!(parse(&error, 0), Ok(Transfer::Error(0x20, [0, 0x20, 0, 0, 0, 0, 128, 0])));
         // Any node may send a data length code of 9 to 15, also in a remote frame (ISO 11898-1:2015, table 5).
         for dlc in 9..=15 {
             let mut long = received;
             long[8] = dlc;
-            assert_eq!(parse(&long, 0), Ok(Said::Frame(answer)), "{dlc}");
+            assert_eq!(parse(&long, 0), Ok(Transfer::Frame(answer)), "{dlc}");
             long[7] = 0x40;
             let remote = Frame::new_remote(answer.id(), 8).unwrap();
-            assert_eq!(parse(&long, 0), Ok(Said::Frame(remote)), "{dlc}");
+            assert_eq!(parse(&long, 0), Ok(Transfer::Frame(remote)), "{dlc}");
         }
         assert_eq!(parse(&received[..19], 0), Err("a transfer of 19 bytes".to_string()));
         assert_eq!(parse(&[], 0), Err("a transfer of 0 bytes".to_string()));
@@ -312,7 +312,7 @@ mod tests {
             let frame = frame(id, &data);
             let mut bytes = emit(&frame, 0, 3);
             bytes[..4].fill(0xFF);
-            prop_assert_eq!(parse(&bytes, 0), Ok(Said::Frame(frame)));
+            prop_assert_eq!(parse(&bytes, 0), Ok(Transfer::Frame(frame)));
         }
     }
 }

@@ -8,16 +8,16 @@ use canopen::frame::Channel;
 use canopen::sdo::client::{Config, GroupDownload, GroupResult, GroupStep, Servers, SERVERS_MAX};
 use canopen::{AbortCode, Frame, Instant};
 
-use super::line::{Item, Line, State, Terms, What};
-use crate::adapter::{Adapter, AdapterError, Met};
+use super::line::{Item, Line, Options, Reply, State};
+use crate::adapter::{Adapter, AdapterError, Delivery};
 
 /// After this many frames in a row, the bus is read.
 const BURST: usize = 8;
 /// A device that makes the download break off this many times in a row gets the data alone.
 const STRIKES: u8 = 2;
 
-/// The meetings of a group. Servers have the numbers of their lines.
-pub(super) struct Meetings {
+/// The downloads of a group. Servers have the numbers of their lines.
+pub(super) struct GroupDownloads {
     timeout_ms: u32,
     cancelled: Arc<AtomicBool>,
     running: Option<Running>,
@@ -38,11 +38,11 @@ struct Running {
     until: Duration,
 }
 
-impl Meetings {
-    pub(super) fn new(terms: &Terms) -> Self {
+impl GroupDownloads {
+    pub(super) fn new(options: &Options) -> Self {
         Self {
-            timeout_ms: u32::try_from(terms.answer.as_millis()).unwrap_or(u32::MAX / 4),
-            cancelled: terms.cancelled.clone(),
+            timeout_ms: u32::try_from(options.answer.as_millis()).unwrap_or(u32::MAX / 4),
+            cancelled: options.cancelled.clone(),
             running: None,
             strikes: Vec::new(),
             has_begun: false,
@@ -112,20 +112,20 @@ impl Meetings {
         let in_group = |line: &&Line| line.channel.is_some() && line.state != State::Gone;
         let members = || lines.iter().flatten().filter(in_group);
         let item = |line: &Line| match &line.state {
-            State::Meeting(item) => Some(item.clone()),
+            State::InGroup(item) => Some(item.clone()),
             _ => None,
         };
         let Some(items) = members().map(item).collect::<Option<Vec<Item>>>() else { return };
         let Some(first) = items.into_iter().min_by_key(|item| item.turn) else { return };
         let is_with = |number: &usize| {
             let line = lines[*number].as_ref();
-            line.is_some_and(|line| in_group(&line) && line.state == State::Meeting(first.clone()))
+            line.is_some_and(|line| in_group(&line) && line.state == State::InGroup(first.clone()))
         };
         let with: Vec<usize> = (0..lines.len().min(SERVERS_MAX)).filter(is_with).collect();
         let channel = with.first().and_then(|number| lines[*number].as_ref()?.channel);
         let is_over = self.is_disturbed || self.cancelled.load(Ordering::Relaxed);
         let (Some(channel), false) = (channel, is_over || with.len() == 1) else {
-            let met = if self.is_disturbed { Met::Disturbed } else { Met::Alone };
+            let met = if self.is_disturbed { Delivery::Disturbed } else { Delivery::Alone };
             with.iter().for_each(|number| wake(lines, *number, met, now));
             return;
         };
@@ -145,11 +145,13 @@ impl Meetings {
             let is_missing = result.missing & 1 << number != 0;
             let refused = running.refused.iter().find(|(line, _)| *line == number);
             let met = match (result.ended, is_missing) {
-                (true, false) => Some(Met::Taken(devices)),
-                (true, true) => Some(refused.map_or(Met::NoAnswer, |(_, code)| Met::Refused(*code))),
+                (true, false) => Some(Delivery::Taken(devices)),
+                (true, true) => {
+                    Some(refused.map_or(Delivery::NoAnswer, |(_, code)| Delivery::Refused(*code)))
+                }
                 (false, true) => {
                     self.strikes[number] += 1;
-                    (self.strikes[number] >= STRIKES).then_some(Met::Alone)
+                    (self.strikes[number] >= STRIKES).then_some(Delivery::Alone)
                 }
                 (false, false) => None,
             };
@@ -161,9 +163,9 @@ impl Meetings {
     }
 }
 
-fn wake(lines: &mut [Option<Line>], number: usize, met: Met, now: Duration) {
+fn wake(lines: &mut [Option<Line>], number: usize, met: Delivery, now: Duration) {
     if let Some(line) = &mut lines[number] {
-        line.wake(Ok(What::Met(met)), now);
+        line.wake(Ok(Reply::Delivery(met)), now);
     }
 }
 

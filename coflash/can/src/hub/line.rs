@@ -8,11 +8,11 @@ use std::time::Duration;
 use canopen::frame::Channel;
 use canopen::{Address, Frame, NodeId};
 
-use crate::adapter::{AdapterError, Met};
+use crate::adapter::{AdapterError, Delivery};
 
 /// How conversations run.
 #[derive(Clone, Debug)]
-pub struct Terms {
+pub struct Options {
     /// How many are at work at the same time.
     pub at_once: usize,
     /// How long the group waits for the answer of a device.
@@ -23,16 +23,16 @@ pub struct Terms {
 
 /// The hub's message to a port.
 pub(super) struct Answer {
-    pub(super) what: Result<What, AdapterError>,
+    pub(super) reply: Result<Reply, AdapterError>,
     pub(super) now: Duration,
 }
 
-pub(super) enum What {
+pub(super) enum Reply {
     Frame(Option<Frame>),
-    Met(Met),
+    Delivery(Delivery),
 }
 
-/// What a conversation brings to a meeting.
+/// What a conversation brings to a download of its group.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) struct Item {
     pub(super) turn: u32,
@@ -51,10 +51,10 @@ pub(super) struct Line {
 
 impl Line {
     /// Lets the conversation continue.
-    pub(super) fn wake(&mut self, what: Result<What, AdapterError>, now: Duration) {
+    pub(super) fn wake(&mut self, reply: Result<Reply, AdapterError>, now: Duration) {
         self.state = State::Running;
         // If the conversation has ended in the meantime, it reports its end itself.
-        let _ = self.answers.send(Answer { what, now });
+        let _ = self.answers.send(Answer { reply, now });
     }
 }
 
@@ -67,6 +67,6 @@ pub(super) enum State {
         until: Duration,
     },
     /// The conversation waits for the others of its group.
-    Meeting(Item),
+    InGroup(Item),
     Gone,
 }

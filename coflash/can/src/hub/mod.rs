@@ -19,11 +19,11 @@ use canopen::nmt::parse_boot_up;
 use canopen::sdo::client::SERVERS_MAX;
 use canopen::{Address, Frame, NodeId};
 
-use self::group::Meetings;
-pub use self::line::Terms;
-use self::line::{Answer, Item, Line, State, What};
+use self::group::GroupDownloads;
+pub use self::line::Options;
+use self::line::{Answer, Item, Line, Reply, State};
 use self::turns::Turns;
-use super::adapter::{Adapter, AdapterError, Group, Met};
+use super::adapter::{Adapter, AdapterError, Delivery, Group};
 
 mod group;
 mod line;
@@ -52,7 +52,7 @@ const GRACE: Duration = Duration::from_secs(1);
 enum Ask {
     Send(usize, Frame),
     Receive { port: usize, until: Duration },
-    Meet { port: usize, item: Item },
+    Deliver { port: usize, item: Item },
     Leave(usize),
     Gone(usize),
 }
@@ -76,11 +76,11 @@ impl Port {
     }
 
     /// Asks the hub, and waits for its answer.
-    fn ask(&mut self, ask: Ask) -> Result<What, AdapterError> {
+    fn ask(&mut self, ask: Ask) -> Result<Reply, AdapterError> {
         self.asks.send(ask).map_err(|_| Self::hub_is_gone())?;
-        let Answer { what, now } = self.answers.recv().map_err(|_| Self::hub_is_gone())?;
+        let Answer { reply, now } = self.answers.recv().map_err(|_| Self::hub_is_gone())?;
         self.now = now;
-        what
+        reply
     }
 }
 
@@ -93,8 +93,8 @@ impl Adapter for Port {
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
         let until = self.now + timeout;
         match self.ask(Ask::Receive { port: self.number, until })? {
-            What::Frame(frame) => Ok(frame),
-            What::Met(_) => Err(Self::hub_is_gone()),
+            Reply::Frame(frame) => Ok(frame),
+            Reply::Delivery(_) => Err(Self::hub_is_gone()),
         }
     }
 
@@ -112,14 +112,14 @@ impl Group for Port {
         self.channel
     }
 
-    fn meet(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Met, AdapterError> {
+    fn deliver(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Delivery, AdapterError> {
         if self.channel.is_none() {
-            return Ok(Met::Alone);
+            return Ok(Delivery::Alone);
         }
         let item = Item { turn, at, data: data.to_vec() };
-        match self.ask(Ask::Meet { port: self.number, item })? {
-            What::Met(met) => Ok(met),
-            What::Frame(_) => Err(Self::hub_is_gone()),
+        match self.ask(Ask::Deliver { port: self.number, item })? {
+            Reply::Delivery(met) => Ok(met),
+            Reply::Frame(_) => Err(Self::hub_is_gone()),
         }
     }
 
@@ -145,11 +145,11 @@ impl Drop for Port {
 pub fn run<'c, R: Send + 'c>(
     adapter: &mut dyn Adapter,
     conversations: Vec<Conversation<'c, R>>,
-    terms: &Terms,
+    options: &Options,
 ) -> Vec<R> {
     let count = conversations.len();
     let nodes: Vec<NodeId> = conversations.iter().map(|conversation| conversation.node).collect();
-    let mut meetings = Meetings::new(terms);
+    let mut downloads = GroupDownloads::new(options);
     let mut turns = Turns::default();
     let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
     let (asks, asked) = channel();
@@ -160,8 +160,8 @@ pub fn run<'c, R: Send + 'c>(
         loop {
             let busy = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state != State::Gone);
             // Who waits for the group has no work.
-            let at_work = |line: &&Line| !matches!(line.state, State::Meeting(_) | State::Gone);
-            while lines.iter().flatten().filter(at_work).count() < terms.at_once.max(1) {
+            let at_work = |line: &&Line| !matches!(line.state, State::InGroup(_) | State::Gone);
+            while lines.iter().flatten().filter(at_work).count() < options.at_once.max(1) {
                 let Some((number, Conversation { node, channel: part, act })) = waiting.pop_front() else {
                     break;
                 };
@@ -183,9 +183,9 @@ pub fn run<'c, R: Send + 'c>(
             settle(adapter, &asked, &mut lines, &mut turns, &mut lost);
             let is_complete = !waiting.iter().any(|(_, conversation)| conversation.channel.is_some());
             if lost.is_none() {
-                lost = meetings.go_on(adapter, &mut lines, is_complete).err();
+                lost = downloads.go_on(adapter, &mut lines, is_complete).err();
             }
-            serve(adapter, &nodes, &mut lines, &mut meetings, &mut turns, &mut lost);
+            serve(adapter, &nodes, &mut lines, &mut downloads, &mut turns, &mut lost);
         }
     });
     drop(done);
@@ -225,7 +225,7 @@ fn settle(
                 waits.insert(port, until);
                 (port, State::Waiting { until })
             }
-            Ask::Meet { port, item } => (port, State::Meeting(item)),
+            Ask::Deliver { port, item } => (port, State::InGroup(item)),
             Ask::Gone(port) => {
                 turns.gone(port);
                 (port, State::Gone)
@@ -254,20 +254,20 @@ fn serve(
     adapter: &mut dyn Adapter,
     nodes: &[NodeId],
     lines: &mut [Option<Line>],
-    meetings: &mut Meetings,
+    downloads: &mut GroupDownloads,
     turns: &mut Turns,
     lost: &mut Option<AdapterError>,
 ) {
     let waiting = |line: &Line| match line.state {
         State::Waiting { until } => Some(until),
-        State::Running | State::Meeting(_) | State::Gone => None,
+        State::Running | State::InGroup(_) | State::Gone => None,
     };
     if lines.iter().flatten().any(|line| line.state == State::Running) {
         return;
     }
     let in_turn = lines.iter().enumerate().filter(|(port, _)| !turns.hold(*port));
     let deadlines = in_turn.filter_map(|(_, line)| waiting(line.as_ref()?));
-    let deadlines = deadlines.chain(meetings.deadline()).chain(turns.deadline());
+    let deadlines = deadlines.chain(downloads.deadline()).chain(turns.deadline());
     let received = match (&lost, deadlines.min()) {
         (Some(error), _) => Err(error.clone()),
         (None, None) => return,
@@ -275,13 +275,13 @@ fn serve(
     };
     let now = adapter.now();
     if let Ok(Some(frame)) = &received {
-        meetings.hear(frame, lines, now);
+        downloads.hear(frame, lines, now);
     }
     for (port, line) in lines.iter_mut().enumerate() {
         let Some(line) = line else { continue };
         let until = match (&line.state, &received) {
             (State::Waiting { until }, _) => *until,
-            (State::Meeting(_), Err(error)) => {
+            (State::InGroup(_), Err(error)) => {
                 line.wake(Err(error.clone()), now);
                 continue;
             }
@@ -299,7 +299,7 @@ fn serve(
             Err(error) => Err(error.clone()),
         };
         turns.woken(port, now);
-        line.wake(frame.map(What::Frame), now);
+        line.wake(frame.map(Reply::Frame), now);
     }
     if let Err(error) = received {
         lost.get_or_insert(error);

@@ -244,12 +244,11 @@ fn usbtin(line: &str, _: usize) -> String {
     .to_string()
 }
 
-/// It has no version.
-fn nameless(line: &str, number: usize) -> String {
-    if line == "V" {
-        "\x07".to_string()
-    } else {
-        lawicel(line, number)
+/// A Lawicel that gives another answer to lines that begin like this.
+fn but(begin: &str, answer: &str, line: &str, number: usize) -> String {
+    match line.starts_with(begin) {
+        true => answer.to_string(),
+        false => lawicel(line, number),
     }
 }
 
@@ -289,7 +288,7 @@ fn adapters_of_the_field_are_opened() {
         ("CANable, first firmware", Device::new(worded), true),
         ("a version of 130 characters", Device::new(board), true),
         ("USBtin", Device::new(usbtin), true),
-        ("BEL for V", Device::new(nameless), true),
+        ("BEL for V", Device::new(|line, n| but("V", "\x07", line, n)), true),
         ("an echo", Device::new(echoes), true),
         ("an echo of characters", Device::new(echoes_characters), true),
         ("CR LF", Device::new(crlf), true),
@@ -402,47 +401,24 @@ fn refused_and_quoted(rate: Option<u32>) {
     }
 }
 
-/// It acknowledges until the bus is to be opened.
-fn half(line: &str, number: usize) -> String {
-    if line == "O" {
-        String::new()
-    } else {
-        lawicel(line, number)
-    }
-}
-
-/// A modem that becomes an adapter, and an adapter that becomes a modem.
-fn modem_first(line: &str, number: usize) -> String {
-    if number < 6 {
-        modem(line, number)
-    } else {
-        lawicel(line, number)
-    }
-}
-
-fn modem_at_last(line: &str, number: usize) -> String {
-    if number < 3 {
-        lawicel(line, number)
-    } else {
-        modem(line, number)
-    }
-}
-
-fn refuses(line: &str, number: usize, what: char) -> String {
-    if line.starts_with(what) {
-        "\x07".to_string()
-    } else {
-        lawicel(line, number)
-    }
+/// One device, and from this line on another one.
+fn turns(first: Answers, at: usize, then: Answers, line: &str, number: usize) -> String {
+    let answers = if number < at { first } else { then };
+    answers(line, number)
 }
 
 #[test]
 fn an_adapter_that_refuses_or_changes_its_mind_is_named() {
     for (name, answers, rate, words) in [
-        ("rate", (|line, n| refuses(line, n, 'S')) as Answers, 125_000, "it refuses the bit rate"),
-        ("bus", |line, n| refuses(line, n, 'O'), 125_000, "it refuses to open the bus"),
+        ("rate", (|line, n| but("S", "\x07", line, n)) as Answers, 125_000, "it refuses the bit rate"),
+        ("bus", |line, n| but("O", "\x07", line, n), 125_000, "it refuses to open the bus"),
         ("no such rate", lawicel, 123_456, "it does not support 123456 bit/s"),
-        ("S is acknowledged, O is not", half, 125_000, "it acknowledges S4, but not O"),
+        (
+            "S is acknowledged, O is not",
+            |line, n| but("O", "", line, n),
+            125_000,
+            "it acknowledges S4, but not O",
+        ),
         ("O is acknowledged, S is not", opens, 125_000, "it acknowledges O, but not S4"),
     ] {
         let mut device = Device::new(answers);
@@ -450,10 +426,10 @@ fn an_adapter_that_refuses_or_changes_its_mind_is_named() {
         assert!(error.contains(words), "{name}: {error}");
         assert!(device.now < ms(8_000), "{name}: {:?}", device.now);
     }
-    let mut device = Device::new(modem_first);
+    let mut device = Device::new(|line, n| turns(modem, 6, lawicel, line, n));
     assert!(open(&mut device, Some(125_000)).is_ok(), "{:?}", device.lines);
     // Its version was that of an adapter.
-    let mut device = Device::new(modem_at_last);
+    let mut device = Device::new(|line, n| turns(lawicel, 3, modem, line, n));
     let error = open(&mut device, Some(125_000)).map(drop).unwrap_err().to_string();
     assert!(error.contains("it sent 'ERROR'"), "{error}");
     let mut gone = Device { gone: true, ..Device::new(lawicel) };
@@ -529,7 +505,7 @@ fn an_echo_is_no_frame_of_the_bus() {
 /// It takes commands, and refuses frames: nobody acknowledges them, and its queue is full.
 #[test]
 fn refused_frames_are_errors_of_the_bus() {
-    let mut device = Device::new(|line, number| refuses(line, number, 't'));
+    let mut device = Device::new(|line, number| but("t", "\x07", line, number));
     let mut bus = open(&mut device, None).unwrap();
     for _ in 0..3 {
         bus.send(&frame(0x605, &[0x40])).unwrap();

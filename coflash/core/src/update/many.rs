@@ -210,8 +210,8 @@ fn flash_each(
         hub::Conversation { node: plan.job.node, channel: plan.channel, act }
     };
     // Devices of a group have nothing else to do than to answer.
-    let terms = hub::Terms { at_once, answer: options.timing.sdo / 2, cancelled: options.cancelled.clone() };
-    hub::run(adapter, jobs.iter().map(conversation).collect(), &terms)
+    let limits = hub::Options { at_once, answer: options.timing.sdo / 2, cancelled: options.cancelled.clone() };
+    hub::run(adapter, jobs.iter().map(conversation).collect(), &limits)
 }
 
 /// Updates the devices behind a gateway one after the other, because a gateway does one transfer at

@@ -227,18 +227,8 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;max-width:48rem;mar
 
 /// Text for HTML.
 fn escaped(text: &str) -> String {
-    let mut all = String::new();
-    for letter in text.chars() {
-        match letter {
-            '&' => all += "&amp;",
-            '<' => all += "&lt;",
-            '>' => all += "&gt;",
-            '"' => all += "&quot;",
-            '\'' => all += "&#39;",
-            letter => all.push(letter),
-        }
-    }
-    all
+    let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
+    text.replace('"', "&quot;").replace('\'', "&#39;")
 }
 
 /// A cell of a CSV file. A spreadsheet takes what begins with one of these characters for a formula, and devices
@@ -272,10 +262,7 @@ mod tests {
             identity: [Some(1), Some(2), Some(3), Some(0x100 + u32::from(node))],
             state: RowState::Updated,
             steps: vec![step],
-            missing: None,
-            trouble: None,
-            left: None,
-            percent: None,
+            ..Row::default()
         }
     }
 

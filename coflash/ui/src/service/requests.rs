@@ -39,7 +39,7 @@ const FILES: [(&str, &str, &str); 9] = [
 /// The page of this station.
 pub(super) fn page(station: &Arc<Station>) -> Page {
     let routes = Router::new()
-        .route("/station", get(tell))
+        .route("/station", get(describe))
         .route("/open", post(open))
         .route("/search", post(search))
         .route("/update", post(update))
@@ -54,7 +54,7 @@ pub(super) fn page(station: &Arc<Station>) -> Page {
 }
 
 /// What does not change while the station runs, and the adapters.
-async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Response {
+async fn describe(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Response {
     let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
     let service = &station.service;
     let manifest = service.package.manifest();

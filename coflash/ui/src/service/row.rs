@@ -9,7 +9,7 @@ use super::trouble;
 use crate::state;
 
 /// A device, or one that is missing.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Row {
     pub(super) node: Option<u8>,
     /// 1008h.
@@ -53,9 +53,10 @@ pub(super) struct Step {
 }
 
 /// The state of a device or of one of its programs, with its key in the table.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(super) enum RowState {
     /// It has its program already.
+    #[default]
     #[serde(rename = "state-has")]
     Has,
     /// It would get its program.
@@ -92,29 +93,22 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             node: Some(device.node.get()),
             name: device.name.clone(),
             identity: device.identity,
-            state: RowState::Has,
             steps: steps.collect(),
-            missing: None,
             trouble: device.steps.iter().find_map(|step| match &step.todo {
                 Todo::Leave(fault) => Some(trouble::of_device(fault)),
                 Todo::Has | Todo::Update => None,
             }),
-            left: None,
-            percent: None,
+            ..Row::default()
         };
         row.sum();
         row
     });
     let missing = plan.missing.iter().map(|missing| Row {
         node: missing.node.map(NodeId::get),
-        name: None,
-        identity: [None; 4],
         state: RowState::Failed,
-        steps: Vec::new(),
         missing: Some(missing.program.clone()),
         trouble: Some(trouble::of_missing(missing)),
-        left: None,
-        percent: None,
+        ..Row::default()
     });
     devices.chain(missing).collect()
 }

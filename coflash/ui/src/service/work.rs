@@ -37,7 +37,7 @@ impl Work for Search {
         match search(station, link, shared) {
             Ok(plan) => {
                 if !plan.devices.is_empty() {
-                    station.service.note_bus(&shared.look(|state| state.adapter.url.clone()));
+                    station.service.note_bus(&shared.read(|state| state.adapter.url.clone()));
                 }
                 change(shared, station, |own| {
                     own.plans += 1;
@@ -76,7 +76,7 @@ fn search(station: &Station, link: &mut Link, shared: &Shared) -> Result<Plan, M
 
 /// Locks nodes among the programs of this computer.
 fn locked(shared: &Shared, nodes: impl Iterator<Item = NodeId>) -> Result<Vec<Lock>, Message> {
-    let url = shared.look(|state| state.adapter.url.clone());
+    let url = shared.read(|state| state.adapter.url.clone());
     let nodes: BTreeSet<NodeId> = nodes.collect();
     let locks: Result<Vec<Lock>, Error> = nodes.into_iter().map(|node| Lock::of(&url, node)).collect();
     locks.map_err(|error| trouble::of_error(&error))
@@ -150,7 +150,7 @@ impl Work for Update {
         };
         let date = wall().as_secs();
         let tell = |node: NodeId, _: usize, event: Event| {
-            shared.told(node, &event);
+            shared.record(node, &event);
             shared.change(|state| {
                 if let Some(update) = state.updates.iter_mut().find(|update| update.node == node.get()) {
                     update.event(&event);
@@ -172,7 +172,7 @@ impl Work for Update {
             package: manifest.name.clone(),
             release: manifest.release.clone(),
             file: service.file.clone(),
-            adapter: shared.look(|state| state.adapter.url.clone()),
+            adapter: shared.read(|state| state.adapter.url.clone()),
             missing: self.plan.missing.iter().map(trouble::of_missing).collect(),
         };
         station.keep(reports(&rows, &Arc::new(of)));

@@ -11,7 +11,8 @@ use coflash_core::machine::{make, Package, Recipe};
 use coflash_core::update::FailedUpdate;
 use coflash_ui::{Failed, Origin, Service};
 use embedded_can::{Frame as _, StandardId};
-use kit::fake::{Bus, Deed, Fake, Maker, Outcome, APPLICATION};
+use kit::fake::lift::{Lift, PHRASE};
+use kit::fake::{Bus, Fake, Maker, Outcome, APPLICATION};
 use kit::folder::Folder;
 use serde_json::{json, Value};
 
@@ -409,70 +410,11 @@ fn what_a_failed_device_has_shown_is_reported() {
     assert!(!failed.tried.is_empty() && !failed.frames.is_empty(), "{failed:?}");
 }
 
-/// A lift device (CiA 814-1 clause 6.3): its application and its bootloader, which is node 126, want the password.
-struct Lift {
-    kept: Arc<Mutex<Vec<u8>>>,
-    is_armed: bool,
-    is_unlocked: bool,
-}
-
-const LIFT: u32 = 0xFE00_01A1;
-const PASSWORD: &str = "Si8Kopen sesame";
-
-impl Lift {
-    fn restart(&mut self) -> (u8, u32) {
-        self.is_unlocked = false;
-        if std::mem::take(&mut self.is_armed) {
-            (126, LIFT)
-        } else {
-            (5, APPLICATION)
-        }
-    }
-}
-
-impl Maker for Lift {
-    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
-        match at {
-            (0x6005, 1) => Some(Err(0x0601_0001)),
-            (0x6005, _) => Some(Err(0x0609_0011)),
-            (0x1F50, 1) if running != APPLICATION && !self.is_unlocked => Some(Err(0x0800_0022)),
-            (0x1F50 | 0x1F56 | 0x1F57, _) => Some(Err(0x0602_0000)),
-            _ => None,
-        }
-    }
-
-    fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>> {
-        let in_bootloader = running != APPLICATION;
-        Some(match at {
-            (0x6005, 1) if data != PASSWORD.as_bytes() => Err(0x0609_0030),
-            (0x6005, 1) => {
-                *(if in_bootloader { &mut self.is_unlocked } else { &mut self.is_armed }) = true;
-                Ok(Deed::Nothing)
-            }
-            (0x1F51, 1) if data == [2] => {
-                let (node, next) = self.restart();
-                Ok(Deed::Restart(node, next))
-            }
-            (0x1F50, 1) if in_bootloader && self.is_unlocked => {
-                *self.kept.lock().unwrap() = data.to_vec();
-                Ok(Deed::Nothing)
-            }
-            _ => Err(0x0800_0022),
-        })
-    }
-
-    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
-        Some(self.restart())
-    }
-}
-
 /// The page asks for the password of a locked device; it is in no state, no report and no message.
 #[test]
 fn a_locked_device_gets_its_password_from_the_page_and_nothing_keeps_it() {
     let folder = kit::folder!("service-password");
-    let kept = Arc::new(Mutex::new(Vec::new()));
-    let mut fake = Fake::new(APPLICATION);
-    fake.maker = Some(Box::new(Lift { kept: kept.clone(), is_armed: false, is_unlocked: false }));
+    let (fake, kept) = Lift::fake(APPLICATION, |_| {});
     let (bus, _server) = kit::fake::serve(fake);
     let programs = "[[program]]\nname = 'door'\nimage = 'app.hex'\nnodes = [5]\ndialect = 'lift'\n";
     let ui = station(&folder, package(&folder, programs), Some(bus));
@@ -480,7 +422,7 @@ fn a_locked_device_gets_its_password_from_the_page_and_nothing_keeps_it() {
     for (password, state, trouble) in [
         ("", "state-failed", Some("trouble-password")),
         ("PLANTED-wrong", "state-failed", Some("trouble-wrong-password")),
-        (PASSWORD, "state-updated", None),
+        (PHRASE, "state-updated", None),
     ] {
         let plan = planned(&ui);
         assert_eq!(plan["asks_password"], true, "{plan}");
@@ -497,7 +439,7 @@ fn a_locked_device_gets_its_password_from_the_page_and_nothing_keeps_it() {
     let texts = saved(&folder, "html").into_iter().chain(saved(&folder, "csv"));
     seen.extend(texts.map(|(name, text)| name + &text));
     seen += &ui.get("station").body;
-    for secret in [PASSWORD, "PLANTED"] {
+    for secret in [PHRASE, "PLANTED"] {
         assert!(!seen.contains(secret), "{seen}");
     }
     let mut order = confirmed(&planned(&ui), &[5]);

@@ -10,7 +10,7 @@ use std::time::Duration;
 use crate::bus::{Coflash, Folder, Nodes, VECTORS};
 use crate::machine;
 use coboot_can::Link;
-use coflash_agent::{run, Buses, Config, Ended, Options, Said, Times};
+use coflash_agent::{run, Buses, Config, Ended, Options, Message, Times};
 use kit::hawkbit::{Action, File, Server};
 
 const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];
@@ -47,7 +47,7 @@ fn options() -> Options {
 
 fn serve(config: &Config, options: &Options) -> (Ended, String) {
     let said = Mutex::new(String::new());
-    let tell = |message: &Said| {
+    let tell = |message: &Message| {
         *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);
     };
     let open = |url: &str| Link::open(url, None).map_err(|error| error.to_string());

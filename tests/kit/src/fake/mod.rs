@@ -8,6 +8,7 @@ use std::time::Duration;
 use canopen::{CobId, Frame};
 use coboot_can::{Adapter, AdapterError};
 
+pub mod lift;
 pub mod renewal;
 mod serve;
 pub mod vault;

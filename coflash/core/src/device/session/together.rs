@@ -8,7 +8,7 @@ use canopen::{Address, CobId};
 use super::{Session, Way};
 use crate::device::doing::Doing;
 use crate::device::error::Error;
-use coboot_can::adapter::{Group, Met};
+use coboot_can::adapter::{Group, Delivery};
 
 impl Session<'_> {
     fn group(&mut self) -> Option<&mut dyn Group> {
@@ -59,15 +59,15 @@ impl Session<'_> {
     }
 
     /// Writes data to all devices of the group that need them, this one among them; see
-    /// [`Group::meet`]. [`Met::Alone`] if there is no group.
+    /// [`Group::deliver`]. [`Delivery::Alone`] if there is no group.
     ///
     /// # Errors
     /// [`Error::Adapter`] or [`Error::Cancelled`].
-    pub(crate) fn write_together(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Met, Error> {
+    pub(crate) fn write_together(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Delivery, Error> {
         self.check_cancelled()?;
         match self.group() {
-            Some(group) => Ok(group.meet(turn, at, data)?),
-            None => Ok(Met::Alone),
+            Some(group) => Ok(group.deliver(turn, at, data)?),
+            None => Ok(Delivery::Alone),
         }
     }
 

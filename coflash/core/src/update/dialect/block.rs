@@ -26,7 +26,7 @@ use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::{steps, trial};
-use coboot_can::adapter::Met;
+use coboot_can::adapter::Delivery;
 
 /// See the [module](self).
 pub(super) struct Block;
@@ -380,17 +380,17 @@ fn send_block(
     let mut in_doubt = false;
     let (own, mut by_other_crc) = (bytes, false);
     loop {
-        let met = if in_group { session.write_together(block, at, bytes)? } else { Met::Alone };
+        let met = if in_group { session.write_together(block, at, bytes)? } else { Delivery::Alone };
         let sent = match met {
-            Met::Taken(devices) => {
+            Delivery::Taken(devices) => {
                 tell(Note::Together { devices }.into());
                 // A block that the device cannot write is reported with the next one.
                 return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
             }
-            Met::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
-            Met::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
-            Met::Alone | Met::Disturbed => {
-                if met == Met::Disturbed {
+            Delivery::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
+            Delivery::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
+            Delivery::Alone | Delivery::Disturbed => {
+                if met == Delivery::Disturbed {
                     tell(Warning::GroupDisturbed.into());
                 }
                 let mut progress =

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coboot_can::hub::{self, Act, Conversation, Terms};
+use coboot_can::hub::{self, Act, Conversation};
 use coboot_can::Adapter;
 use coflash_core::device::Transfers;
 use coflash_core::file::block_file;
@@ -104,8 +104,8 @@ fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
     };
     let node = |number| NodeId::new(number).unwrap();
     let with = |number, wait| Conversation { node: node(number), channel: None, act: conversation(wait) };
-    let terms = Terms { at_once: 3, answer: Duration::from_millis(500), cancelled: Arc::default() };
-    let ended = hub::run(&mut bus, vec![with(3, 100), with(4, 7), with(5, 30)], &terms);
+    let limits = hub::Options { at_once: 3, answer: Duration::from_millis(500), cancelled: Arc::default() };
+    let ended = hub::run(&mut bus, vec![with(3, 100), with(4, 7), with(5, 30)], &limits);
     let ms = Duration::from_millis;
     assert_eq!(ended[0], (ms(100), vec![frame(0x583), frame(0x603), frame(0x703), frame(0x083)]));
     assert_eq!(ended[1], (ms(7), vec![frame(0x584)]));
