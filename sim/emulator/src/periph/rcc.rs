@@ -3,7 +3,7 @@
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::silicon::Silicon;
 use crate::time::{Span, Time};
-use crate::variant::Variant;
+use crate::variant::{Plain, Variant};
 
 // Start-up times, typical, from the datasheet (DocID022152 rev 8, section 5.3.8 to 5.3.10).
 const HSI_START: Span = Span(2_200_000);
@@ -133,8 +133,8 @@ pub struct Rcc {
     hse_hz: u32,
     variant: &'static Variant,
     silicon: Silicon,
-    /// The values of the variant's plain registers, in its order.
-    plain: Vec<u32>,
+    /// The variant's plain registers.
+    plain: Vec<Plain>,
     hsi: Source,
     hse: Source,
     pll: Source,
@@ -158,7 +158,7 @@ impl Rcc {
             hse_hz,
             variant,
             silicon,
-            plain: variant.rcc.iter().map(|&(_, reset, _)| reset).collect(),
+            plain: variant.rcc().collect(),
             hsi: Source::On { ready: Time(0) },
             hse: Source::Off,
             pll: Source::Off,
@@ -221,11 +221,7 @@ impl Rcc {
     /// A register that is kept as written; 0 for any other.
     #[must_use]
     pub fn plain(&self, offset: u32) -> u32 {
-        self.position(offset).map_or(0, |index| self.plain[index])
-    }
-
-    fn position(&self, offset: u32) -> Option<usize> {
-        self.variant.rcc.iter().position(|&(at, _, _)| at == offset)
+        self.plain.iter().find(|register| register.at == offset).map_or(0, |register| register.value)
     }
 
     fn unknown(&self) -> Unmodelled {
@@ -361,7 +357,10 @@ impl Peripheral for Rcc {
             }
             // CIR: see `write`.
             0x0C => 0,
-            _ => self.position(offset).map(|index| self.plain[index]).ok_or_else(|| self.unknown())?,
+            _ => match self.plain.iter().find(|register| register.at == offset) {
+                Some(register) => register.value,
+                None => return Err(self.unknown()),
+            },
         })
     }
 
@@ -402,11 +401,13 @@ impl Peripheral for Rcc {
                 }
             }
             _ => {
-                let index = self.position(offset).ok_or_else(|| self.unknown())?;
-                // Reserved bits stay what they are after a reset.
-                let (_, reset, bits) = self.variant.rcc[index];
-                self.plain[index] = value & bits | reset & !bits;
-                if bits == 0 && value != 0 {
+                let register = self.plain.iter_mut().find(|register| register.at == offset);
+                let is_there = register.is_some_and(|register| {
+                    // Reserved bits stay what they are after a reset.
+                    register.value = value & register.bits | register.reset & !register.bits;
+                    register.bits != 0 || value == 0
+                });
+                if !is_there {
                     return Err(self.unknown());
                 }
             }
