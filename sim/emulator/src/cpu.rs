@@ -16,11 +16,10 @@
 //! all the same while the FPU is off; CCR.BFHFNMIGN is for stores that a register refuses, and an
 //! access to where nothing is locks the core up all the same at priority -1.
 
-mod accesses;
 mod blocks;
 mod exceptions;
 mod hooks;
-mod traps;
+mod instruction;
 
 use std::collections::HashSet;
 
@@ -197,6 +196,7 @@ impl Cpu {
         uc.ctl_exits_enable().map_err(failed("choosing the exits"))?;
         let mut cpu = Self { uc };
         cpu.map_memories()?;
+        cpu.map_registers().map_err(failed("mapping peripherals"))?;
         cpu.add_hooks().map_err(failed("adding the hooks"))?;
         Ok(cpu)
     }

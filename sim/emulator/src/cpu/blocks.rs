@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use super::instruction::Instruction;
 use crate::chip::Chip;
 use crate::costs;
 use crate::report::Access;
@@ -58,28 +59,20 @@ pub fn count_instructions(chip: &Chip, address: u32, size: u32) -> Block {
     let mut block = Block::default();
     let Some((memory, offset)) = chip.memory(address) else { return block };
     let Some(code) = memory.bytes().get(offset..(offset + size as usize)) else { return block };
-    let mut at = 0;
-    while at + 2 <= code.len() {
-        let first = u16::from_le_bytes([code[at], code[at + 1]]);
-        // DDI 0403E A5.1: the upper five bits 11101, 11110, 11111 start a 32-bit instruction.
-        let wide = first >> 11 >= 0b11101;
+    let mut at = address;
+    while let Some(instruction) =
+        code.get((at - address) as usize..).and_then(|code| Instruction::take(at, code))
+    {
+        let Instruction { first, second, .. } = instruction;
+        let is_wide = instruction.len() == 4;
         // Coprocessor space (A5.3.18) with coprocessor number 10 or 11.
-        if wide && first & 0xEC00 == 0xEC00 && block.fpu.is_none() {
-            let coprocessor = code.get(at + 3).map(|byte| byte & 0x0F);
-            if matches!(coprocessor, Some(0xA | 0xB)) {
-                block.fpu = Some(address + at as u32);
-            }
+        if is_wide && first & 0xEC00 == 0xEC00 && matches!(second >> 8 & 0xF, 0xA | 0xB) {
+            block.fpu = block.fpu.or(Some(at));
         }
         block.instructions += 1;
-        block.last = u32::from(first);
-        at += 2;
-        let mut second = 0;
-        if wide {
-            second = code.get(at..at + 2).map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
-            block.last = block.last << 16 | u32::from(second);
-            at += 2;
-        }
+        block.last = if is_wide { u32::from(first) << 16 | u32::from(second) } else { first.into() };
         block.cycles += if chip.costs { costs::of_instruction(first, second) } else { 1 };
+        at += instruction.len();
     }
     if chip.costs && chip.geometry.sram.contains(address, 1) {
         block.cycles += costs::of_fetch_from_sram(size);

@@ -6,8 +6,8 @@ use unicorn_engine::unicorn_const::{uc_error, HookType, MemType, Prot, TlbEntry}
 use unicorn_engine::{RegisterARM, Unicorn};
 
 use super::blocks::count_instructions;
-use super::traps::{self, Instruction};
-use super::{accesses, failed, masks, read, Cpu, Fault, State, NOWHERE, XPSR_IT};
+use super::instruction::{self, Instruction};
+use super::{failed, masks, read, Cpu, Fault, State, NOWHERE, XPSR_IT};
 use crate::chip::memory_map::{
     counts_cycles, HIDDEN, OPTION_PAGE, OTP, PATCHED, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
     PRIVATE, SRAM_ALIAS, SYSTEM,
@@ -23,25 +23,18 @@ use crate::time::Time;
 
 impl Cpu {
     pub(super) fn map_memories(&mut self) -> Result<(), Error> {
-        let state = self.uc.get_data();
-        let (sram_base, sram_size) = (state.chip.geometry.sram.base, state.chip.geometry.sram.size);
-        let ccm_base = state.chip.geometry.ccm.base;
-        let flash_base = state.chip.geometry.flash.base;
+        let chip = &self.uc.get_data().chip;
         let pointer = |memory: &HostMemory| (memory.as_ptr(), memory.size() as u64);
-        let chip = &state.chip;
+        let (flash, sram, ccm) = (chip.geometry.flash, chip.geometry.sram, chip.geometry.ccm);
+        let ccm = (ccm.size > 0).then(|| (ccm.base, pointer(&chip.ccm), Prot::READ | Prot::WRITE));
         let blocks = [
-            (flash_base, pointer(&chip.flash.array), Prot::READ | Prot::EXEC),
-            (sram_base, pointer(&chip.sram), Prot::ALL),
-            (ccm_base, pointer(&chip.ccm), Prot::READ | Prot::WRITE),
+            (flash.base, pointer(&chip.flash.array), Prot::READ | Prot::EXEC),
+            (sram.base, pointer(&chip.sram), Prot::ALL),
             (SYSTEM.base, pointer(&chip.system), Prot::READ | Prot::EXEC),
             (OPTION_PAGE.base, pointer(&chip.options), Prot::READ),
             (PATCHED.base, pointer(&chip.patched), Prot::READ | Prot::EXEC),
         ];
-        let with_ccm = chip.geometry.ccm.size > 0;
-        for (base, (memory, len), perms) in blocks {
-            if base == ccm_base && !with_ccm {
-                continue;
-            }
+        for (base, (memory, len), perms) in blocks.into_iter().chain(ccm) {
             // SAFETY: the memory belongs to the chip, which the engine's data owns: the engine is
             // closed before its data is dropped. Its length is a multiple of the page size
             // (`HostMemory::new`).
@@ -50,59 +43,58 @@ impl Cpu {
             // Mapping alone would let stores through to read-only memory without the hook.
             self.uc.mem_protect(base.into(), len, perms).map_err(failed("protecting memory"))?;
         }
+        Ok(())
+    }
+
+    /// Maps what is no memory: loads and stores become calls.
+    pub(super) fn map_registers(&mut self) -> Result<(), uc_error> {
         for region in [PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE] {
             let base = region.base;
-            self.uc
-                .mmio_map(
-                    u64::from(base),
-                    u64::from(region.size.next_multiple_of(PAGE)),
-                    Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize| {
-                        let address = base + offset as u32;
-                        note_moment(uc, Access::Read, address);
-                        let value = uc.get_data_mut().chip.load(address, size as u8);
-                        locate_reports(uc);
-                        u64::from(value)
-                    }),
-                    Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
-                        let address = base + offset as u32;
-                        note_moment(uc, Access::Write, address);
-                        uc.get_data_mut().chip.store(address, size as u8, value as u32);
-                        settle_bus_error(uc);
-                        locate_reports(uc);
-                    }),
-                )
-                .map_err(failed("mapping peripherals"))?;
+            self.uc.mmio_map(
+                base.into(),
+                region.size.next_multiple_of(PAGE).into(),
+                Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize| {
+                    let address = base + offset as u32;
+                    note_moment(uc, Access::Read, address);
+                    let value = uc.get_data_mut().chip.load(address, size as u8);
+                    locate_reports(uc);
+                    u64::from(value)
+                }),
+                Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
+                    let address = base + offset as u32;
+                    note_moment(uc, Access::Write, address);
+                    uc.get_data_mut().chip.store(address, size as u8, value as u32);
+                    settle_bus_error(uc);
+                    locate_reports(uc);
+                }),
+            )?;
         }
-        self.uc
-            .mmio_map(
-                HIDDEN.base.into(),
-                HIDDEN.size.into(),
-                Some(|uc: &mut Unicorn<'_, State>, _: u64, _: usize| {
-                    uc.get_data_mut().chip.flash.load_hidden();
-                    0
-                }),
-                None::<fn(&mut Unicorn<'_, State>, u64, usize, u64)>,
-            )
-            .map_err(failed("mapping what is hidden"))?;
-        self.uc
-            .mmio_map(
-                SRAM_ALIAS.into(),
-                u64::from(sram_size) * 32,
-                Some(|uc: &mut Unicorn<'_, State>, offset: u64, _size: usize| {
-                    let chip = &uc.get_data().chip;
-                    chip.sram_bit(SRAM_ALIAS + offset as u32)
-                        .map_or(0, |(byte, bit)| u64::from(chip.sram.bytes()[byte] >> bit & 1))
-                }),
-                Some(move |uc: &mut Unicorn<'_, State>, offset: u64, _size: usize, value: u64| {
-                    let chip = &mut uc.get_data_mut().chip;
-                    if let Some((byte, bit)) = chip.sram_bit(SRAM_ALIAS + offset as u32) {
-                        let cell = &mut chip.sram.bytes_mut()[byte];
-                        *cell = *cell & !(1 << bit) | (value as u8 & 1) << bit;
-                    }
-                }),
-            )
-            .map_err(failed("mapping the bit-band alias"))?;
-        Ok(())
+        self.uc.mmio_map(
+            HIDDEN.base.into(),
+            HIDDEN.size.into(),
+            Some(|uc: &mut Unicorn<'_, State>, _: u64, _: usize| {
+                uc.get_data_mut().chip.flash.load_hidden();
+                0
+            }),
+            None::<fn(&mut Unicorn<'_, State>, u64, usize, u64)>,
+        )?;
+        let sram = self.uc.get_data().chip.geometry.sram;
+        self.uc.mmio_map(
+            SRAM_ALIAS.into(),
+            u64::from(sram.size) * 32,
+            Some(|uc: &mut Unicorn<'_, State>, offset: u64, _size: usize| {
+                let chip = &uc.get_data().chip;
+                chip.sram_bit(SRAM_ALIAS + offset as u32)
+                    .map_or(0, |(byte, bit)| u64::from(chip.sram.bytes()[byte] >> bit & 1))
+            }),
+            Some(move |uc: &mut Unicorn<'_, State>, offset: u64, _size: usize, value: u64| {
+                let chip = &mut uc.get_data_mut().chip;
+                if let Some((byte, bit)) = chip.sram_bit(SRAM_ALIAS + offset as u32) {
+                    let cell = &mut chip.sram.bytes_mut()[byte];
+                    *cell = *cell & !(1 << bit) | (value as u8 & 1) << bit;
+                }
+            }),
+        )
     }
 
     pub(super) fn add_hooks(&mut self) -> Result<(), uc_error> {
@@ -235,7 +227,7 @@ fn locate(uc: &Unicorn<'_, State>, from: u32, access: Access, address: u32) -> O
     let (memory, offset) = chip.memory(start)?;
     let code = memory.bytes().get(offset + from as usize..offset + size as usize)?;
     let registers = std::array::from_fn(|n| base_register(uc, n as u32));
-    accesses::find(code, &registers, access, address).map(|offset| from + offset)
+    instruction::find(code, &registers, access, address).map(|offset| from + offset)
 }
 
 /// The program accesses a register. If it belongs to a counter of the core, the chip has to know the cycle.
@@ -354,14 +346,14 @@ fn on_instruction(uc: &mut Unicorn<'_, State>, address: u32) {
 /// Whether it may start.
 fn judge_rest_of_it_block(uc: &mut Unicorn<'_, State>, address: u32) -> bool {
     let xpsr = read(uc, RegisterARM::XPSR);
-    let it = traps::it_state(xpsr);
+    let it = instruction::it_state(xpsr);
     if it & 0xF == 0 {
         uc.get_data_mut().notes.it_block = (0, 0);
         return true;
     }
     let State { chip, notes } = uc.get_data();
     let status = instruction(chip, address)
-        .filter(|_| traps::holds(it >> 4, xpsr))
+        .filter(|_| instruction::holds(it >> 4, xpsr))
         .and_then(|instruction| instruction.traps(notes.traps, |n| base_register(uc, n)));
     if let Some(status) = status {
         uc.get_data_mut().notes.fault = Some(Fault::usage(status));
@@ -380,7 +372,7 @@ fn may_run_it_block(uc: &mut Unicorn<'_, State>, first: u32, it: u8) -> bool {
         let Some(instruction) = instruction(chip, at) else { break };
         // What the first one finds is known; the others may find it changed.
         let doubtful = if at == first {
-            traps::holds(state >> 4, xpsr)
+            instruction::holds(state >> 4, xpsr)
                 && instruction.traps(notes.traps, |n| base_register(uc, n)).is_some()
         } else {
             instruction.may_trap(notes.traps)
@@ -389,7 +381,7 @@ fn may_run_it_block(uc: &mut Unicorn<'_, State>, first: u32, it: u8) -> bool {
             in_doubt = in_doubt.or(Some(at));
         }
         at = at.wrapping_add(instruction.len());
-        state = traps::advance(state);
+        state = instruction::advance(state);
     }
     let notes = &mut uc.get_data_mut().notes;
     notes.it_block = (first, at);
@@ -437,6 +429,10 @@ fn replace_words(chip: &mut Chip, address: u32, code: bool) -> Option<u32> {
     Some(PATCHED.base + slot + address % PAGE)
 }
 
+fn entry(address: u32, perms: Prot) -> Option<TlbEntry> {
+    Some(TlbEntry { paddr: address.into(), perms })
+}
+
 /// Unicorn asks for the mapping of a page. Memory is mapped to its own address, and flash also to
 /// address 0. A RAM page becomes executable with the first fetch from it, because stores to
 /// executable pages are slow.
@@ -444,7 +440,6 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
     let geometry = chip.geometry;
-    let entry = |paddr: u32, perms| Some(TlbEntry { paddr: u64::from(paddr), perms });
     if state.notes.balances {
         return entry(address, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ });
     }
@@ -459,42 +454,7 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         return entry(paddr, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ | Prot::EXEC });
     }
     if chip.is_flash(address) {
-        let offset = paddr - geometry.flash.base;
-        let is_hidden = chip.flash.hides(offset);
-        return match kind {
-            MemType::READ if chip.flash.is_shut() => {
-                state.notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
-                None
-            }
-            MemType::FETCH if chip.flash.is_shut() => {
-                state.notes.fault = Some(Fault::bus(cfsr::IBUSERR, None));
-                None
-            }
-            // A separate entry that allows only writes; the hook of stores carries out the store.
-            MemType::WRITE => entry(paddr, Prot::WRITE),
-            MemType::READ if is_flash_busy(chip) => {
-                state.notes.flash_busy = true;
-                None
-            }
-            MemType::READ if is_hidden => entry(HIDDEN.base + offset, Prot::READ),
-            MemType::READ | MemType::FETCH if has_patches(chip, address) => {
-                // Separate entries: fetches and loads are patched separately.
-                let is_fetch = kind == MemType::FETCH;
-                state.notes.flash_executed[(offset / PAGE) as usize] |= is_fetch;
-                let place = replace_words(chip, address, is_fetch).unwrap_or(paddr);
-                entry(place, if is_fetch { Prot::EXEC } else { Prot::READ })
-            }
-            _ => {
-                // As for RAM: the first fetch from a page that was only read so far must come here,
-                // so that the page is recorded as executed.
-                let executed = &mut state.notes.flash_executed[(offset / PAGE) as usize];
-                *executed |= kind == MemType::FETCH;
-                if is_hidden {
-                    return entry(paddr, Prot::EXEC);
-                }
-                entry(paddr, if *executed { Prot::READ | Prot::EXEC } else { Prot::READ })
-            }
-        };
+        return flash_entry(state, address, paddr, kind);
     }
     let is_ram = geometry.sram.contains(address, 1) || geometry.ccm.contains(address, 1);
     if let Some(watch) = chip.slice.watch.as_mut().filter(|watch| watch.inside && is_ram) {
@@ -522,6 +482,48 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         return None;
     }
     entry(address, Prot::READ | Prot::WRITE)
+}
+
+/// The same for a page of the flash, which is at `paddr`.
+fn flash_entry(state: &mut State, address: u32, paddr: u32, kind: MemType) -> Option<TlbEntry> {
+    let State { chip, notes } = state;
+    let offset = paddr - chip.geometry.flash.base;
+    let page = (offset / PAGE) as usize;
+    let is_hidden = chip.flash.hides(offset);
+    match kind {
+        MemType::READ if chip.flash.is_shut() => {
+            notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
+            None
+        }
+        MemType::FETCH if chip.flash.is_shut() => {
+            notes.fault = Some(Fault::bus(cfsr::IBUSERR, None));
+            None
+        }
+        // A separate entry that allows only writes; the hook of stores carries out the store.
+        MemType::WRITE => entry(paddr, Prot::WRITE),
+        MemType::READ if is_flash_busy(chip) => {
+            notes.flash_busy = true;
+            None
+        }
+        MemType::READ if is_hidden => entry(HIDDEN.base + offset, Prot::READ),
+        MemType::READ | MemType::FETCH if has_patches(chip, address) => {
+            // Separate entries: fetches and loads are patched separately.
+            let is_fetch = kind == MemType::FETCH;
+            notes.flash_executed[page] |= is_fetch;
+            let place = replace_words(chip, address, is_fetch).unwrap_or(paddr);
+            entry(place, if is_fetch { Prot::EXEC } else { Prot::READ })
+        }
+        _ => {
+            // As for RAM: the first fetch from a page that was only read so far must come here,
+            // so that the page is recorded as executed.
+            notes.flash_executed[page] |= kind == MemType::FETCH;
+            match notes.flash_executed[page] {
+                _ if is_hidden => entry(paddr, Prot::EXEC),
+                true => entry(paddr, Prot::READ | Prot::EXEC),
+                false => entry(paddr, Prot::READ),
+            }
+        }
+    }
 }
 
 /// A load or store at an address without memory or peripheral.

@@ -1,8 +1,13 @@
-//! Which instruction traps by CCR.DIV_0_TRP or CCR.UNALIGN_TRP, before it runs (DDI 0403E B3.2.8).
+//! What an instruction loads or stores: which one of a block makes a given access, and which one traps by
+//! CCR.DIV_0_TRP or CCR.UNALIGN_TRP before it runs (DDI 0403E B3.2.8).
+//!
+//! Unicorn passes the address to a peripheral's callback, but not the instruction. The registers are up to date
+//! then, so the instruction is the one whose base and offset give that address.
 //!
 //! Encodings: DDI 0403E A5.2 to A5.3; which accesses have to be aligned: A3.2.1.
 
 use crate::cortex::scs::{cfsr, Traps};
+use crate::report::Access;
 
 /// An instruction; `second` is 0 for one of 16 bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -12,18 +17,58 @@ pub struct Instruction {
     pub second: u16,
 }
 
-/// What decides whether an instruction traps.
-enum Check {
+/// What an instruction does, as far as it can trap or access a peripheral.
+enum Operation {
     /// The divisor is this register.
     Division(u32),
-    /// Base, offset and the size that the address has to be aligned to.
-    Access { base: u32, offset: Offset, size: u32 },
+    Transfer(Transfer),
+}
+
+/// A load or store.
+struct Transfer {
+    is_load: bool,
+    /// The register with the base.
+    base: u32,
+    offset: Offset,
+    /// Bytes from there that it may touch; 0 for the FPU's, which are not looked for.
+    len: u32,
+    /// What the address has to be aligned to; 1 for nothing.
+    alignment: u32,
 }
 
 enum Offset {
     Up(u32),
     Down(u32),
     Register { number: u32, shift: u32 },
+}
+
+impl Transfer {
+    /// The lowest address, with these registers.
+    fn address(&self, register: impl Fn(u32) -> Option<u32>) -> Option<u32> {
+        let base = register(self.base)?;
+        Some(match self.offset {
+            Offset::Up(offset) => base.wrapping_add(offset),
+            Offset::Down(offset) => base.wrapping_sub(offset),
+            Offset::Register { number, shift } => base.wrapping_add(register(number)? << shift),
+        })
+    }
+}
+
+/// The address, relative to the block, of the first instruction in `code` that makes this access,
+/// the registers being `registers` (r0 to r14; the PC is no base of an access to a peripheral).
+pub fn find(code: &[u8], registers: &[u32; 15], access: Access, address: u32) -> Option<u32> {
+    let mut at = 0;
+    while let Some(instruction) = Instruction::take(at, code.get(at as usize..)?) {
+        if let Some(Operation::Transfer(transfer)) = instruction.operation() {
+            let first = transfer.address(|number| registers.get(number as usize).copied());
+            let touches = |first: u32| address.wrapping_sub(first) < transfer.len;
+            if transfer.is_load == (access == Access::Read) && first.is_some_and(touches) {
+                return Some(at);
+            }
+        }
+        at += instruction.len();
+    }
+    None
 }
 
 impl Instruction {
@@ -52,36 +97,37 @@ impl Instruction {
 
     /// Whether it may trap at all.
     pub fn may_trap(self, traps: Traps) -> bool {
-        match self.check() {
-            Some(Check::Division(_)) => traps.division,
-            Some(Check::Access { .. }) => traps.unaligned,
+        match self.operation() {
+            Some(Operation::Division(_)) => traps.division,
+            Some(Operation::Transfer(transfer)) => traps.unaligned && transfer.alignment > 1,
             None => false,
         }
     }
 
     /// The CFSR bit of the UsageFault that it raises with these registers (r0 to r14).
     pub fn traps(self, traps: Traps, register: impl Fn(u32) -> u32) -> Option<u32> {
-        match self.check()? {
-            Check::Division(divisor) => (traps.division && register(divisor) == 0).then_some(cfsr::DIVBYZERO),
-            Check::Access { base, offset, size } => {
+        match self.operation()? {
+            Operation::Division(divisor) => {
+                (traps.division && register(divisor) == 0).then_some(cfsr::DIVBYZERO)
+            }
+            Operation::Transfer(transfer) => {
                 // As a base, the PC is that of the next instruction but one, aligned to 4; TBH does
                 // not align it, and it is even.
-                let base = if base == 15 { (self.address + 4) & !3 } else { register(base) };
-                let address = match offset {
-                    Offset::Up(offset) => base.wrapping_add(offset),
-                    Offset::Down(offset) => base.wrapping_sub(offset),
-                    Offset::Register { number, shift } => base.wrapping_add(register(number) << shift),
-                };
-                (traps.unaligned && address % size != 0).then_some(cfsr::UNALIGNED)
+                let pc = (self.address + 4) & !3;
+                let address = transfer.address(|n| Some(if n == 15 { pc } else { register(n) }))?;
+                (traps.unaligned && address % transfer.alignment != 0).then_some(cfsr::UNALIGNED)
             }
         }
     }
 
-    fn check(self) -> Option<Check> {
+    fn operation(self) -> Option<Operation> {
         if self.len() == 2 {
-            narrow(self.first)
+            narrow(self.first).map(Operation::Transfer)
+        } else if self.first & 0xFFD0 == 0xFB90 && self.second & 0xF0F0 == 0xF0F0 {
+            // SDIV, UDIV (A5.3.17).
+            Some(Operation::Division(field(self.second, 0, 4)))
         } else {
-            wide(self.first, self.second)
+            wide(self.first, self.second).map(Operation::Transfer)
         }
     }
 }
@@ -121,79 +167,74 @@ fn field(word: u16, shift: u32, bits: u32) -> u32 {
     u32::from(word) >> shift & ((1 << bits) - 1)
 }
 
-fn narrow(code: u16) -> Option<Check> {
+fn narrow(code: u16) -> Option<Transfer> {
     let (base, offset) = (field(code, 3, 3), field(code, 6, 5));
-    let (offset, size) = match code >> 11 {
-        // STR, STRH, (STRB, LDRSB,) LDR, LDRH, (LDRB,) LDRSH with a register as the offset.
+    let is_load = field(code, 11, 1) == 1;
+    let transfer = |offset, size| Some(Transfer { is_load, base, offset, len: size, alignment: size });
+    match code >> 11 {
+        // STR, STRH, STRB, LDRSB, LDR, LDRH, LDRB, LDRSH with a register as the offset.
         0b01010 | 0b01011 => {
-            let size = match field(code, 9, 3) {
+            let kind = field(code, 9, 3);
+            let alignment = match kind {
                 0b000 | 0b100 => 4,
                 0b001 | 0b101 | 0b111 => 2,
-                _ => return None,
+                _ => 1,
             };
-            (Offset::Register { number: field(code, 6, 3), shift: 0 }, size)
+            let offset = Offset::Register { number: field(code, 6, 3), shift: 0 };
+            Some(Transfer { is_load: kind >= 3, base, offset, len: 4, alignment })
         }
-        0b01100 | 0b01101 => (Offset::Up(4 * offset), 4),
-        0b10000 | 0b10001 => (Offset::Up(2 * offset), 2),
+        0b01100 | 0b01101 => transfer(Offset::Up(4 * offset), 4),
+        0b01110 | 0b01111 => transfer(Offset::Up(offset), 1),
+        0b10000 | 0b10001 => transfer(Offset::Up(2 * offset), 2),
         // STM, LDM.
         0b11000 | 0b11001 => {
-            return Some(Check::Access { base: field(code, 8, 3), offset: Offset::Up(0), size: 4 })
+            let len = 4 * (code & 0xFF).count_ones();
+            Some(Transfer { is_load, base: field(code, 8, 3), offset: Offset::Up(0), len, alignment: 4 })
         }
-        // The rest goes by SP or PC, which are aligned, or loads no more than bytes.
-        _ => return None,
-    };
-    Some(Check::Access { base, offset, size })
+        // The rest goes by SP or PC, which are aligned and no bases of a peripheral.
+        _ => None,
+    }
 }
 
-fn wide(first: u16, second: u16) -> Option<Check> {
+fn wide(first: u16, second: u16) -> Option<Transfer> {
     let base = field(first, 0, 4);
-    let up = field(first, 7, 1) == 1;
-    let by = |offset: u32| if up { Offset::Up(offset) } else { Offset::Down(offset) };
-    // SDIV, UDIV (A5.3.17).
-    if first & 0xFFD0 == 0xFB90 && second & 0xF0F0 == 0xF0F0 {
-        return Some(Check::Division(field(second, 0, 4)));
-    }
+    let (is_load, up) = (field(first, 4, 1) == 1, field(first, 7, 1) == 1);
+    let transfer = |offset, len, alignment| Some(Transfer { is_load, base, offset, len, alignment });
+    let by = |up: bool, offset: u32| if up { Offset::Up(offset) } else { Offset::Down(offset) };
     // Loads and stores of one register (A5.3.7 to A5.3.10).
     if first & 0xFE00 == 0xF800 {
-        let (load, size) = (field(first, 4, 1) == 1, 1 << field(first, 5, 2));
-        let hint = load && size == 2 && second >> 12 == 15;
-        if size == 1 || size == 8 || hint {
-            return None;
-        }
+        let size = 1 << field(first, 5, 2);
+        let is_hint = is_load && size == 2 && second >> 12 == 15;
         let offset = if base == 15 || up {
             // The literal forms and the ones with 12 bits.
-            by(field(second, 0, 12))
+            by(up, field(second, 0, 12))
         } else if field(second, 11, 1) == 0 {
             Offset::Register { number: field(second, 0, 4), shift: field(second, 4, 2) }
         } else if field(second, 10, 1) == 0 {
             Offset::Up(0)
-        } else if field(second, 9, 1) == 1 {
-            Offset::Up(field(second, 0, 8))
         } else {
-            Offset::Down(field(second, 0, 8))
+            by(field(second, 9, 1) == 1, field(second, 0, 8))
         };
-        return Some(Check::Access { base, offset, size });
+        return transfer(offset, size.min(4), if is_hint || size == 8 { 1 } else { size });
     }
-    let words = Some(Check::Access { base, offset: Offset::Up(0), size: 4 });
+    let indexed = if field(first, 8, 1) == 1 { by(up, 4 * field(second, 0, 8)) } else { Offset::Up(0) };
     // LDRD, STRD; with neither index nor write-back TBH, and the exclusive ones, which Unicorn
     // checks (A5.3.6).
     if first & 0xFE40 == 0xE840 {
         return match (first & 0x0120, first & 0xFFF0, second & 0xFFF0) {
-            (0, 0xE8D0, 0xF010) => {
-                let offset = Offset::Register { number: field(second, 0, 4), shift: 1 };
-                Some(Check::Access { base, offset, size: 2 })
-            }
-            (0, _, _) => None,
-            _ => words,
+            (0, 0xE8D0, 0xF010) => transfer(Offset::Register { number: field(second, 0, 4), shift: 1 }, 2, 2),
+            (0, _, _) => transfer(indexed, 8, 1),
+            _ => transfer(indexed, 8, 4),
         };
     }
     // LDM, STM (A5.3.5).
     if first & 0xFE40 == 0xE800 {
-        return words;
+        let len = 4 * second.count_ones();
+        return transfer(if field(first, 8, 1) == 1 { Offset::Down(len) } else { Offset::Up(0) }, len, 4);
     }
     // VLDR, VSTR, VLDM, VSTM (A6.5); the rest of this space moves two registers (A6.7).
     if first & 0xFE00 == 0xEC00 && second & 0x0E00 == 0x0A00 && first & 0x01A0 != 0 {
-        return words;
+        return transfer(Offset::Up(0), 0, 4);
     }
     None
 }
@@ -290,5 +331,43 @@ mod tests {
         assert_eq!(advance(states[2]), 0);
         assert_eq!(it_state(0x0600_FC00), 0xFF);
         assert_eq!(Instruction { address: 0, first: 0xBF30, second: 0 }.it_state(), None, "wfi");
+    }
+
+    /// Machine code from GNU as.
+    #[test]
+    fn finds_loads_and_stores_of_every_shape() {
+        let mut registers = [0; 15];
+        registers[1] = 0x4000_0000;
+        registers[2] = 0x10;
+        for (code, access, address) in [
+            (&[0x6848][..], Access::Read, 0x4000_0004),      // ldr r0, [r1, #4]
+            (&[0x6048], Access::Write, 0x4000_0004),         // str r0, [r1, #4]
+            (&[0x7848], Access::Read, 0x4000_0001),          // ldrb r0, [r1, #1]
+            (&[0x8088], Access::Write, 0x4000_0004),         // strh r0, [r1, #4]
+            (&[0x5888], Access::Read, 0x4000_0010),          // ldr r0, [r1, r2]
+            (&[0x5088], Access::Write, 0x4000_0010),         // str r0, [r1, r2]
+            (&[0xC919], Access::Read, 0x4000_0008),          // ldmia r1, {r0, r3, r4}
+            (&[0xF8D1, 0x0234], Access::Read, 0x4000_0234),  // ldr.w r0, [r1, #564]
+            (&[0xF8C1, 0x0234], Access::Write, 0x4000_0234), // str.w r0, [r1, #564]
+            (&[0xF841, 0x0D04], Access::Write, 0x3FFF_FFFC), // str.w r0, [r1, #-4]!
+            (&[0xF851, 0x0B04], Access::Read, 0x4000_0000),  // ldr.w r0, [r1], #4
+            (&[0xF851, 0x0022], Access::Read, 0x4000_0040),  // ldr.w r0, [r1, r2, lsl #2]
+            (&[0xE9D1, 0x0302], Access::Read, 0x4000_000C),  // ldrd r0, r3, [r1, #8]
+            (&[0xE9C1, 0x0302], Access::Write, 0x4000_0008), // strd r0, r3, [r1, #8]
+        ] {
+            // Something harmless before it: movs r0, #1.
+            let code: Vec<u8> =
+                [0x2001].iter().chain(code).flat_map(|half: &u16| half.to_le_bytes()).collect();
+            assert_eq!(find(&code, &registers, access, address), Some(2), "{code:02X?}");
+            assert_eq!(find(&code, &registers, access, address + 0x100), None);
+            let other = if access == Access::Read { Access::Write } else { Access::Read };
+            assert_eq!(find(&code, &registers, other, address), None);
+        }
+    }
+
+    #[test]
+    fn cut_off_code_is_no_trouble() {
+        assert_eq!(find(&[0xD1, 0xF8], &[0; 15], Access::Read, 0), None);
+        assert_eq!(find(&[0xD1], &[0; 15], Access::Read, 0), None);
     }
 }
