@@ -267,7 +267,7 @@ impl Chip {
     /// of the vector table; `None` if a program is in the system memory here, or if neither bank has one.
     pub fn dual_bank_boot(&mut self) -> Option<u32> {
         let is_empty = self.system.bytes()[..4] == [0xFF; 4];
-        if !self.flash.boots_from_system_memory() || !is_empty {
+        if !self.flash.options.boots_from_system_memory() || !is_empty {
             return None;
         }
         let Region { base, size } = self.geometry.sram;
@@ -301,7 +301,7 @@ impl Chip {
             _ => self.pwr.reset(),
         }
         self.reset_core_domain(cause);
-        if self.flash.hardware_watchdog() {
+        if self.flash.options.hardware_watchdog() {
             let now = self.now();
             // The key that starts the watchdog is always accepted.
             let _ = self.iwdg.write(0x00, 0xCCCC, now);
@@ -316,13 +316,6 @@ impl Chip {
         if self.pwr.enter_standby() {
             self.wake_up();
         }
-    }
-
-    /// Whether the option bits have a reset in place of the deep sleep that a WFI enters (section 7.1.1,
-    /// low-power management reset).
-    #[must_use]
-    pub fn deep_sleep_is_reset(&self, is_standby: bool) -> bool {
-        self.flash.low_power_is_reset(is_standby)
     }
 
     /// The crystal of the board has this frequency from now on, 0 when it stops.
@@ -377,7 +370,7 @@ impl Chip {
     /// Follows VDD.
     fn follow_supply(&mut self, now: Time) {
         let mv = self.supply.at(now);
-        if let Some(change) = self.supervisor.watch(mv, self.flash.brown_out_level(), now) {
+        if let Some(change) = self.supervisor.watch(mv, self.flash.options.brown_out_level(), now) {
             self.slice.supply = Some(change);
             self.slice.leave = true;
         }
@@ -429,11 +422,11 @@ impl Chip {
                 self.block_mut(block).reset();
             }
         }
-        if self.flash.boots_from_system_memory() {
+        if self.flash.options.boots_from_system_memory() {
             self.syscfg.boot_from_system_memory();
         }
         self.wire_pins();
-        let option_bytes = self.flash.option_bytes();
+        let option_bytes = self.flash.options.bytes();
         self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
         self.apply_clocks();
         // A power reset, which brown-out and the end of Standby are, too (RM0090 section 7.1.2), resets all of it.

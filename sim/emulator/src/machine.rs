@@ -442,7 +442,10 @@ impl Machine {
     /// The core executes WFI or WFE, or sleeps on exit: it sleeps as `light` says unless SLEEPDEEP is set.
     fn fall_asleep(&mut self, light: Activity) -> Entry {
         match self.cpu.chip().deep_sleep_is_standby() {
-            Some(is_standby) if !self.cpu.wakes() && self.cpu.chip().deep_sleep_is_reset(is_standby) => {
+            // The option bits have a reset in place of it (section 7.1.1, low-power management reset).
+            Some(is_standby)
+                if !self.cpu.wakes() && self.cpu.chip().flash.options.low_power_is_reset(is_standby) =>
+            {
                 let slice = &mut self.cpu.chip_mut().slice;
                 slice.reset_request = Some(ResetCause::LowPower);
                 return Entry::Taken;
@@ -633,7 +636,7 @@ impl Machine {
     /// Sets all option bytes as a debug probe does, in the form of FLASH_OPTCR. Bits that the chip does not
     /// have are shown and have no effect, as has DB1M.
     pub fn set_option_bytes(&mut self, optcr: u32) {
-        self.cpu.chip_mut().flash.preset_options(optcr);
+        self.cpu.chip_mut().flash.options.preset_all(optcr);
     }
 
     /// Sets the option bits BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
@@ -641,12 +644,12 @@ impl Machine {
     /// # Panics
     /// For another level.
     pub fn set_brown_out_level(&mut self, level: u8) {
-        self.cpu.chip_mut().flash.preset_brown_out_level(level);
+        self.cpu.chip_mut().flash.options.preset_brown_out_level(level);
     }
 
     /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.
     pub fn set_hardware_watchdog(&mut self, on: bool) {
-        self.cpu.chip_mut().flash.preset_hardware_watchdog(on);
+        self.cpu.chip_mut().flash.options.preset_hardware_watchdog(on);
     }
 
     /// The crystal of the board stops (0), or has this frequency again, in Hz. A core that runs from a
@@ -658,7 +661,7 @@ impl Machine {
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
     /// anything else level 1.
     pub fn set_read_protection(&mut self, rdp: u8) {
-        self.cpu.chip_mut().flash.preset_read_protection(rdp);
+        self.cpu.chip_mut().flash.options.preset_read_protection(rdp);
     }
 
     /// CAN controller `n`; 0 is CAN1, 1 is CAN2.

@@ -140,7 +140,8 @@ pub struct Flash {
     sr: u32,
     cr: u32,
     lock: Lock,
-    options: OptionBytes,
+    /// The option bytes.
+    pub(crate) options: OptionBytes,
     /// A debugger has connected, with read-out protection: no access until the next power-on.
     is_shut: bool,
     running: Option<Running>,
@@ -316,22 +317,6 @@ impl Flash {
         ((self.cr & CR_PSIZE) >> 8) as usize
     }
 
-    /// BOR_LEV of the option bytes: 0 to 2 are levels 3 to 1, 3 is off.
-    #[must_use]
-    pub fn brown_out_level(&self) -> u8 {
-        self.options.brown_out_level()
-    }
-
-    /// Sets all option bytes as a debug probe does, in the form of OPTCR.
-    pub fn preset_options(&mut self, optcr: u32) {
-        self.options.preset_all(optcr);
-    }
-
-    /// Sets BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
-    pub fn preset_brown_out_level(&mut self, level: u8) {
-        self.options.preset_brown_out_level(level);
-    }
-
     /// Arms a power cut; operations are counted from now on.
     pub fn cut_power_at(&mut self, cut: Option<FlashCut>) {
         self.cut = cut;
@@ -385,17 +370,6 @@ impl Flash {
         self.array.bytes_mut()[start..start + bytes.len()].copy_from_slice(bytes);
         self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
         self.show_lines();
-    }
-
-    /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
-    /// anything else level 1.
-    pub fn preset_read_protection(&mut self, rdp: u8) {
-        self.options.preset_read_protection(rdp);
-    }
-
-    /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.
-    pub fn preset_hardware_watchdog(&mut self, on: bool) {
-        self.options.preset_hardware_watchdog(on);
     }
 
     /// The power fails now: the running operation is torn. `seed` chooses how.
@@ -453,20 +427,12 @@ impl Flash {
         self.is_shut
     }
 
-    /// BFB2: whether the chip boots from the system memory in place of the flash.
-    #[must_use]
-    pub fn boots_from_system_memory(&self) -> bool {
-        self.options.boots_from_system_memory()
-    }
-
     /// Whether the data bus is kept out of the sector with this offset (PCROP, section 3.7.5).
     #[must_use]
     pub fn hides(&self, offset: u32) -> bool {
         let Some(sector) = self.geometry.sector_at(self.geometry.flash.base + offset) else { return false };
-        match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
-            Some(within) => self.options.hides_second(within),
-            None => self.options.hides(sector.number),
-        }
+        let (bank, number) = self.within_bank(sector.number);
+        self.options.hides(bank, number)
     }
 
     /// The CPU loads from such a sector.
@@ -482,10 +448,14 @@ impl Flash {
         if self.is_shut {
             return true;
         }
-        match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
-            Some(within) => self.options.protects_second(within),
-            None => self.options.protects(sector.number),
-        }
+        let (bank, number) = self.within_bank(sector.number);
+        self.options.protects(bank, number)
+    }
+
+    /// The bank of a sector, 0 or 1, and its number in it.
+    fn within_bank(&self, sector: u8) -> (usize, u8) {
+        let second = self.geometry.second_bank.and_then(|first| sector.checked_sub(first));
+        second.map_or((0, sector), |number| (1, number))
     }
 
     /// Sets the option bytes as a debug probe does: at once, and unnoticed by the running program.
@@ -493,11 +463,9 @@ impl Flash {
     /// # Panics
     /// For a sector without a bit of its own.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
-        match self.geometry.second_bank.and_then(|first| number.checked_sub(first)) {
-            Some(within) if within < 12 => self.options.preset_second(within, protected),
-            None if number < 12 => self.options.preset_protection(number, protected),
-            _ => panic!("sector {number} has no bit of nWRP"),
-        }
+        let (bank, within) = self.within_bank(number);
+        assert!(within < 12, "sector {number} has no bit of nWRP");
+        self.options.preset_protection(bank, within, protected);
     }
 
     fn refuse(&mut self, flag: u32, why: &'static str) -> Store {
@@ -727,24 +695,6 @@ impl Flash {
             }
         }
         Ok(())
-    }
-
-    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.7.1).
-    #[must_use]
-    pub fn option_bytes(&self) -> [u8; 16] {
-        self.options.bytes()
-    }
-
-    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.7.1).
-    #[must_use]
-    pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
-        self.options.low_power_is_reset(is_standby)
-    }
-
-    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.7.1).
-    #[must_use]
-    pub fn hardware_watchdog(&self) -> bool {
-        self.options.hardware_watchdog()
     }
 }
 

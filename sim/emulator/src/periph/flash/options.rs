@@ -62,26 +62,16 @@ pub enum Request {
 pub struct OptionBytes {
     /// The bits of OPTCR that the chip keeps.
     kept: u32,
-    /// What is programmed, as OPTCR shows it.
-    programmed: u32,
-    /// OPTCR as written.
-    register: u32,
-    /// The same of OPTCR1.
-    programmed_second: u32,
-    register_second: u32,
+    /// What is programmed, as OPTCR and OPTCR1 show it.
+    programmed: [u32; 2],
+    /// OPTCR and OPTCR1 as written.
+    register: [u32; 2],
     lock: Lock,
 }
 
 impl Default for OptionBytes {
     fn default() -> Self {
-        Self {
-            kept: KEPT,
-            programmed: FACTORY,
-            register: FACTORY,
-            programmed_second: SECOND,
-            register_second: SECOND,
-            lock: Lock::default(),
-        }
+        Self { kept: KEPT, programmed: [FACTORY, SECOND], register: [FACTORY, SECOND], lock: Lock::default() }
     }
 }
 
@@ -115,13 +105,13 @@ impl OptionBytes {
     #[must_use]
     pub fn read(&self, programming: bool) -> u32 {
         let lock = if self.lock.is_open() { 0 } else { OPTLOCK };
-        self.register | lock | if programming { OPTSTRT } else { 0 }
+        self.register[0] | lock | if programming { OPTSTRT } else { 0 }
     }
 
     /// OPTCR1 as it reads.
     #[must_use]
     pub fn read_second(&self) -> u32 {
-        self.register_second
+        self.register[1]
     }
 
     /// Takes a write to OPTCR1: a wish until OPTSTRT programs it with the others.
@@ -132,7 +122,7 @@ impl OptionBytes {
         if !self.lock.is_open() {
             return Err(Unmodelled("FLASH_OPTCR1 is written while it is locked: the chip ignores it".into()));
         }
-        self.register_second = value & SECOND;
+        self.register[1] = value & SECOND;
         Ok(())
     }
 
@@ -144,7 +134,7 @@ impl OptionBytes {
         if !self.lock.is_open() {
             return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
         }
-        self.register = value & self.kept;
+        self.register[0] = value & self.kept;
         if value & OPTLOCK != 0 {
             self.lock = self.lock.close();
         } else if value & OPTSTRT != 0 {
@@ -158,7 +148,7 @@ impl OptionBytes {
             if self.takes_protection_back() {
                 return Ok(Request::Protected);
             }
-            return Ok(Request::Program(self.register));
+            return Ok(Request::Program(self.register[0]));
         }
         Ok(Request::Done)
     }
@@ -166,28 +156,25 @@ impl OptionBytes {
     /// Whether the registers would take SPRMOD or the protection of a sector back, without the erase that goes
     /// with the way to level 0.
     fn takes_protection_back(&self) -> bool {
-        let opens = self.level() == 1 && level_of(self.register) == 0;
-        let lost = |old: u32, new: u32| old & !new & NWRP != 0;
-        let is_lost = self.register & SPRMOD == 0
-            || lost(self.programmed, self.register)
-            || lost(self.programmed_second, self.register_second);
+        let opens = self.level() == 1 && level_of(self.register[0]) == 0;
+        let lost = |bank: usize| self.programmed[bank] & !self.register[bank] & NWRP != 0;
+        let is_lost = self.register[0] & SPRMOD == 0 || lost(0) || lost(1);
         self.hides_code() && is_lost && !opens
     }
 
     fn hides_code(&self) -> bool {
-        self.programmed & self.kept & SPRMOD != 0
+        self.programmed[0] & self.kept & SPRMOD != 0
     }
 
-    /// Whether the data bus is kept out of a sector from 0 to 11.
-    #[must_use]
-    pub fn hides(&self, sector: u8) -> bool {
-        self.hides_code() && self.programmed >> 16 & 1 << sector != 0
+    /// The bit of nWRP of a sector from 0 to 11 of a bank, 0 or 1.
+    fn nwrp(&self, bank: usize, sector: u8) -> bool {
+        self.programmed[bank] >> 16 & 1 << sector != 0
     }
 
-    /// The same for a sector of the second bank, counted from 0.
+    /// Whether the data bus is kept out of a sector from 0 to 11 of a bank, 0 or 1.
     #[must_use]
-    pub fn hides_second(&self, sector: u8) -> bool {
-        self.hides_code() && self.programmed_second >> 16 & 1 << sector != 0
+    pub fn hides(&self, bank: usize, sector: u8) -> bool {
+        self.hides_code() && self.nwrp(bank, sector)
     }
 
     /// Whether the chip has the protection against reading.
@@ -199,92 +186,77 @@ impl OptionBytes {
     /// BFB2: whether the chip boots from the system memory in place of the flash.
     #[must_use]
     pub fn boots_from_system_memory(&self) -> bool {
-        self.programmed & self.kept & BFB2 != 0
+        self.programmed[0] & self.kept & BFB2 != 0
     }
 
     /// The option bytes are programmed. Returns whether that erases the array: read-out protection
     /// went from level 1 to level 0.
     pub fn program(&mut self, value: u32) -> bool {
         let before = self.level();
-        self.programmed = value & self.kept;
-        self.programmed_second = self.register_second;
+        self.programmed = [value & self.kept, self.register[1]];
         before == 1 && self.level() == 0
     }
 
     /// The power fails, or a reset comes, while they are programmed.
     pub fn tear(&mut self) {
-        self.programmed = ERASED & self.kept;
-        self.programmed_second = SECOND;
+        self.programmed = [ERASED & self.kept, SECOND];
     }
 
     /// A reset: the register is loaded, and locked.
     pub fn reset(&mut self) {
         self.register = self.programmed;
-        self.register_second = self.programmed_second;
         self.lock = Lock::default();
     }
 
     /// The level of read-out protection, 0 to 2 (section 3.7.3).
     #[must_use]
     pub fn level(&self) -> u8 {
-        level_of(self.programmed)
+        level_of(self.programmed[0])
     }
 
-    /// nWRP: a zero protects the sector, with SPRMOD a one (sections 3.7.4 and 3.9.10). For sectors 0 to 11.
+    /// nWRP: a zero protects the sector, with SPRMOD a one (sections 3.7.4 and 3.9.10). For sectors 0 to 11 of a
+    /// bank, 0 or 1.
     #[must_use]
-    pub fn protects(&self, sector: u8) -> bool {
-        (self.programmed >> 16 & 1 << sector == 0) != (self.programmed & SPRMOD != 0)
-    }
-
-    /// The same for a sector of the second bank, counted from 0.
-    #[must_use]
-    pub fn protects_second(&self, sector: u8) -> bool {
-        (self.programmed_second >> 16 & 1 << sector == 0) != (self.programmed & SPRMOD != 0)
-    }
-
-    /// Sets nWRP of a sector of the second bank, counted from 0, as a debug probe does.
-    pub fn preset_second(&mut self, sector: u8, protected: bool) {
-        let bit = 1 << (16 + sector);
-        for options in [&mut self.programmed_second, &mut self.register_second] {
-            *options = *options & !bit | if protected { 0 } else { bit };
-        }
+    pub fn protects(&self, bank: usize, sector: u8) -> bool {
+        self.nwrp(bank, sector) == (self.programmed[0] & SPRMOD != 0)
     }
 
     /// Sets all of them as a debug probe does, in the form of OPTCR, with bits that some lines alone have.
     pub fn preset_all(&mut self, optcr: u32) {
-        self.preset(!(OPTLOCK | OPTSTRT), optcr & !(OPTLOCK | OPTSTRT));
+        self.preset(0, !(OPTLOCK | OPTSTRT), optcr & !(OPTLOCK | OPTSTRT));
     }
 
-    /// Sets nWRP of a sector as a debug probe does: at once, and unnoticed by the running program.
-    pub fn preset_protection(&mut self, sector: u8, protected: bool) {
+    /// Sets nWRP of a sector from 0 to 11 of a bank as a debug probe does: at once, and unnoticed by the running
+    /// program.
+    pub fn preset_protection(&mut self, bank: usize, sector: u8, protected: bool) {
         let bit = 1 << (16 + sector);
-        self.preset(bit, if protected { 0 } else { bit });
+        self.preset(bank, bit, if protected { 0 } else { bit });
     }
 
     /// Sets RDP as a debug probe does.
     pub fn preset_read_protection(&mut self, rdp: u8) {
-        self.preset(0xFF00, u32::from(rdp) << 8);
+        self.preset(0, 0xFF00, u32::from(rdp) << 8);
     }
 
     /// Sets WDG_SW as a debug probe does: the watchdog starts with each reset.
     pub fn preset_hardware_watchdog(&mut self, on: bool) {
-        self.preset(1 << 5, u32::from(!on) << 5);
+        self.preset(0, 1 << 5, u32::from(!on) << 5);
     }
 
     /// Sets BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
     pub fn preset_brown_out_level(&mut self, level: u8) {
         assert!(level <= 3, "there are three levels");
-        self.preset(0b11 << 2, u32::from(3 - level) << 2);
+        self.preset(0, 0b11 << 2, u32::from(3 - level) << 2);
     }
 
     /// BOR_LEV as programmed: 0 to 2 are levels 3 to 1, 3 is off (section 3.9.9).
     #[must_use]
     pub fn brown_out_level(&self) -> u8 {
-        (self.programmed >> 2 & 0b11) as u8
+        (self.programmed[0] >> 2 & 0b11) as u8
     }
 
-    fn preset(&mut self, mask: u32, value: u32) {
-        for options in [&mut self.programmed, &mut self.register] {
+    fn preset(&mut self, bank: usize, mask: u32, value: u32) {
+        for options in [&mut self.programmed[bank], &mut self.register[bank]] {
             *options = *options & !mask | value;
         }
     }
@@ -293,8 +265,8 @@ impl OptionBytes {
     #[must_use]
     pub fn bytes(&self) -> [u8; 16] {
         let mut bytes = [0xFF; 16];
-        let low = self.programmed as u16;
-        let high = (self.programmed >> 16 & 0x0FFF) as u16;
+        let low = self.programmed[0] as u16;
+        let high = (self.programmed[0] >> 16 & 0x0FFF) as u16;
         bytes[0..2].copy_from_slice(&low.to_le_bytes());
         bytes[2..4].copy_from_slice(&(!low).to_le_bytes());
         bytes[8..10].copy_from_slice(&high.to_le_bytes());
@@ -305,13 +277,13 @@ impl OptionBytes {
     /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.7.1).
     #[must_use]
     pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
-        self.programmed & (if is_standby { 1 << 7 } else { 1 << 6 }) == 0
+        self.programmed[0] & (if is_standby { 1 << 7 } else { 1 << 6 }) == 0
     }
 
     /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.7.1).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
-        self.programmed & 1 << 5 == 0
+        self.programmed[0] & 1 << 5 == 0
     }
 }
 
@@ -346,7 +318,7 @@ mod tests {
         assert_eq!(options.read(false), 0x0FFF_AAED);
         assert_eq!(options.bytes()[..4], [0xEC, 0xAA, 0x13, 0x55]);
         assert_eq!(options.level(), 0);
-        assert!((0..12).all(|sector| !options.protects(sector)));
+        assert!((0..12).all(|sector| !options.protects(0, sector)));
         assert!(!options.hardware_watchdog());
     }
 
@@ -355,7 +327,7 @@ mod tests {
         let mut options = OptionBytes::default();
         options.preset_all(0x8011_AAEF);
         assert_eq!(options.read(false), 0x8011_AAED, "OPTLOCK is no option, OPTSTRT neither");
-        assert!((0..12).filter(|sector| options.protects(*sector)).eq([0, 4]));
+        assert!((0..12).filter(|sector| options.protects(0, *sector)).eq([0, 4]));
         for (bits, level) in [(0x0FFF_AAE0, 0), (0x0FFF_AAE4, 1), (0x0FFF_AAE8, 2), (0x0FFF_AAEC, 3)] {
             options.preset_all(bits);
             assert_eq!(options.brown_out_level(), level);
@@ -367,7 +339,7 @@ mod tests {
         let mut options = open();
         assert_eq!(options.write(0x0FFE_AAEC), Ok(Request::Done));
         assert_eq!(options.read(false), 0x0FFE_AAEC);
-        assert!(!options.protects(0));
+        assert!(!options.protects(0, 0));
         options.reset();
         assert_eq!(options.read(false), 0x0FFF_AAED, "loaded again, and locked");
     }
@@ -380,7 +352,7 @@ mod tests {
         assert!(!options.program(0x0FFC_AAEC));
         options.reset();
         assert_eq!(options.read(false), 0x0FFC_AAED);
-        let protected: Vec<u8> = (0..12).filter(|sector| options.protects(*sector)).collect();
+        let protected: Vec<u8> = (0..12).filter(|sector| options.protects(0, *sector)).collect();
         assert_eq!(protected, [0, 1]);
     }
 
@@ -393,12 +365,12 @@ mod tests {
         let mut options = open();
         options.write_second(0xFFFD_FFFF).unwrap();
         assert_eq!(options.read_second(), 0x0FFD_0000);
-        assert!(!options.protects_second(1), "not programmed yet");
+        assert!(!options.protects(1, 1), "not programmed yet");
         options.program(0x0FFF_AAEC);
         options.reset();
-        assert!((0..12).filter(|sector| options.protects_second(*sector)).eq([1]));
-        assert!((0..12).all(|sector| !options.protects(sector)));
-        options.preset_second(1, false);
+        assert!((0..12).filter(|sector| options.protects(1, *sector)).eq([1]));
+        assert!((0..12).all(|sector| !options.protects(0, sector)));
+        options.preset_protection(1, 1, false);
         assert_eq!(options.read_second(), 0x0FFF_0000);
     }
 
@@ -457,7 +429,7 @@ mod tests {
         let mut options = opened(OptionBytes::of(&STM32F429ZI));
         assert_eq!(options.write(SECTOR_5 | OPTSTRT), Ok(Request::Program(SECTOR_5)));
         options.program(SECTOR_5);
-        assert!((0..12).filter(|sector| options.hides(*sector)).eq([5]));
+        assert!((0..12).filter(|sector| options.hides(0, *sector)).eq([5]));
         for (value, wanted) in [
             (SECTOR_5 & !SPRMOD, Request::Protected),
             (0x8000_AAEC, Request::Protected),
@@ -472,12 +444,12 @@ mod tests {
         options.program(0x8020_55EC);
         assert_eq!(options.write(0x0FFF_AAEC | OPTSTRT), Ok(Request::Program(0x0FFF_AAEC)));
         assert!(options.program(0x0FFF_AAEC), "the array is erased");
-        assert!((0..12).all(|sector| !options.hides(sector)));
+        assert!((0..12).all(|sector| !options.hides(0, sector)));
 
         let mut options = opened(OptionBytes::of(&STM32F407VG));
         assert_eq!(options.write(0x8020_AAFC | OPTSTRT), Ok(Request::Program(0x0020_AAEC)));
         options.preset_all(0x8020_AAFC);
-        assert!(!options.hides(5) && !options.boots_from_system_memory());
+        assert!(!options.hides(0, 5) && !options.boots_from_system_memory());
     }
 
     /// The forum's report above: ones are SPRMOD and nWRP, too.
@@ -485,7 +457,7 @@ mod tests {
     fn torn_ones_of_an_stm32f429_hide_the_whole_flash() {
         let mut options = OptionBytes::of(&STM32F429ZI);
         options.tear();
-        assert!((0..12).all(|sector| options.hides(sector) && options.hides_second(sector)));
+        assert!((0..12).all(|sector| options.hides(0, sector) && options.hides(1, sector)));
         assert_eq!(options.level(), 1);
     }
 }

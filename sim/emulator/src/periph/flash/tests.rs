@@ -285,7 +285,7 @@ fn option_bytes_take_their_time_and_protect_then() {
 #[test]
 fn leaving_read_out_protection_erases_the_array() {
     let mut flash = with_open_options();
-    flash.preset_read_protection(0x55);
+    flash.options.preset_read_protection(0x55);
     flash.array.bytes_mut().fill(0);
     flash.write(OPTCR, 0x0FFF_AAEE, Time(0)).unwrap();
     flash.advance(Time(u64::MAX));
