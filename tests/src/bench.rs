@@ -134,7 +134,7 @@ impl Bench {
     }
 
     fn at(controller: u8, bootloader: &str, chips: Vec<Options>) -> Self {
-        let mut world = World::empty();
+        let mut world = World::new();
         let heard = Rc::new(RefCell::new(Vec::new()));
         let ears = Rc::clone(&heard);
         world.add_sink(move |record| ears.borrow_mut().push(*record));

@@ -95,7 +95,7 @@ impl Endpoint {
             }
             let target = pacer.target(Instant::now(), self.bench.time());
             if target <= self.bench.time() {
-                self.server.wait(Duration::from_micros(500));
+                std::thread::park_timeout(Duration::from_micros(500));
             }
             let mut delivered = self.bench.serve(&mut self.server, target);
             if let Some(serial) = &mut self.serial {

@@ -394,10 +394,10 @@ impl Door {
 
 /// Serves one debugger after the other.
 fn serve(listener: &TcpListener, events: &SyncSender<Event>, owner: &Thread) {
-    let tell = |event| {
-        let told = events.send(event).is_ok();
+    let send = |event| {
+        let is_sent = events.send(event).is_ok();
         owner.unpark();
-        told
+        is_sent
     };
     loop {
         let Ok((stream, peer)) = listener.accept() else {
@@ -408,16 +408,16 @@ fn serve(listener: &TcpListener, events: &SyncSender<Event>, owner: &Thread) {
         let _ = stream.set_nodelay(true);
         let _ = stream.set_write_timeout(Some(PATIENCE));
         let Ok(mut reading) = stream.try_clone() else { continue };
-        if !tell(Event::Connected { stream, peer }) {
+        if !send(Event::Connected { stream, peer }) {
             return;
         }
         let mut buffer = [0; 1024];
         while let Ok(len @ 1..) = reading.read(&mut buffer) {
-            if !tell(Event::Bytes(buffer[..len].to_vec())) {
+            if !send(Event::Bytes(buffer[..len].to_vec())) {
                 return;
             }
         }
-        if !tell(Event::Gone) {
+        if !send(Event::Gone) {
             return;
         }
     }

@@ -19,7 +19,7 @@
 //! | [`bus`], [`frame`] | the CAN bus: arbitration, errors, faults; frames and their bits |
 //! | [`time`], [`pacing`] | virtual time, and how it follows the wall clock |
 //! | [`socketcand`], [`serial`], [`control`] | the bus, a USART, and power and pins for other programs |
-//! | `gdb` | the door for gdb (feature `gdb`) |
+//! | [`gdb`] | the door for gdb |
 //! | [`candump`], [`rtt`], [`defmt`] | the log of the bus, and what a program prints |
 
 pub mod bus;
@@ -34,7 +34,6 @@ pub mod cpu;
 pub mod defmt;
 pub mod error;
 pub mod frame;
-#[cfg(feature = "gdb")]
 pub mod gdb;
 pub mod machine;
 pub mod memory;

@@ -110,7 +110,7 @@ pub struct Lag {
     /// Where the present window began.
     since: Option<(Instant, Time)>,
     /// The pace that was reported last, in tenths of the requested speed.
-    said: u32,
+    reported: u32,
 }
 
 /// How long the world is watched before the first report.
@@ -120,12 +120,12 @@ impl Lag {
     /// Begins to watch.
     #[must_use]
     pub fn new(speed: Speed) -> Self {
-        Self { speed, since: None, said: 10 }
+        Self { speed, since: None, reported: 10 }
     }
 
     /// The world has come to `now`: a text where the pace has changed since the last one. At
     /// [`Speed::Max`] there is none to keep.
-    pub fn look(&mut self, wall: Instant, now: Time) -> Option<String> {
+    pub fn check(&mut self, wall: Instant, now: Time) -> Option<String> {
         let Speed::Times(times) = self.speed else { return None };
         let (began, start) = *self.since.get_or_insert((wall, now));
         let took = wall.saturating_duration_since(began);
@@ -136,10 +136,10 @@ impl Lag {
         let wanted = scaled(took, times).0.max(1) as f64;
         let tenths = (((now - start).0 as f64 / wanted * 10.0).round() as u32).min(10);
         // A tenth more or less is no news, but being in time again is.
-        if tenths.abs_diff(self.said) < 2 && (tenths < 10 || self.said == 10) {
+        if tenths.abs_diff(self.reported) < 2 && (tenths < 10 || self.reported == 10) {
             return None;
         }
-        self.said = tenths;
+        self.reported = tenths;
         Some(match tenths {
             10 => format!("the emulation keeps up again: {times} of real time"),
             _ => format!(
@@ -219,15 +219,15 @@ mod tests {
     fn lags(speed: Speed, paces: &[u64]) -> Vec<(usize, String)> {
         let start = Instant::now();
         let mut lag = Lag::new(speed);
-        let (mut now, mut said) = (Time(0), Vec::new());
+        let (mut now, mut reports) = (Time(0), Vec::new());
         for (second, pace) in paces.iter().enumerate() {
             for tenth in 0..10_u64 {
                 let wall = start + Duration::from_millis(1_000 * second as u64 + 100 * tenth);
-                said.extend(lag.look(wall, now).map(|text| (second, text)));
+                reports.extend(lag.check(wall, now).map(|text| (second, text)));
                 now = now + Span::from_millis(pace / 10);
             }
         }
-        said
+        reports
     }
 
     /// A loop without a pause would advance the world in each round, and use all of a core of the

@@ -17,11 +17,11 @@ pub mod protocol;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::mpsc::{sync_channel, Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::sync::mpsc::{sync_channel, Receiver, SyncSender, TrySendError};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::{self, Thread};
 use std::time::Duration;
@@ -148,7 +148,6 @@ impl Client {
 pub struct Server {
     address: SocketAddr,
     events: Receiver<Event>,
-    early: VecDeque<Event>,
     clients: BTreeMap<ClientId, Client>,
     /// The client that handed in the frame, by ticket.
     owners: HashMap<u64, ClientId>,
@@ -175,7 +174,6 @@ impl Server {
         Ok(Self {
             address,
             events,
-            early: VecDeque::new(),
             clients: BTreeMap::new(),
             owners: HashMap::new(),
             notices: Vec::new(),
@@ -203,20 +201,10 @@ impl Server {
     /// Hands the clients' frames to the port, and the port's frames to the clients. Gives the
     /// number of frames that clients got.
     pub fn exchange<M: Computer>(&mut self, world: &mut World<M>, port: PortId) -> usize {
-        while let Some(event) = self.early.pop_front().or_else(|| self.events.try_recv().ok()) {
+        while let Ok(event) = self.events.try_recv() {
             self.handle_event(event, world, port);
         }
         self.send_queued(world, port)
-    }
-
-    /// Sleeps until a client wants something, for `longest` at most.
-    pub fn wait(&mut self, longest: Duration) {
-        match self.events.recv_timeout(longest) {
-            Ok(event) => self.early.push_back(event),
-            Err(RecvTimeoutError::Timeout) => {}
-            // The listening thread ends only with the server.
-            Err(RecvTimeoutError::Disconnected) => thread::sleep(longest),
-        }
     }
 
     fn handle_event<M: Computer>(&mut self, event: Event, world: &mut World<M>, port: PortId) {

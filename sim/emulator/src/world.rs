@@ -188,12 +188,6 @@ impl World<Machine> {
 }
 
 impl<M: Computer> World<M> {
-    /// A bench with a bus and nothing on it.
-    #[must_use]
-    pub fn empty() -> Self {
-        Self::default()
-    }
-
     /// The time up to which everything has happened.
     #[must_use]
     pub fn now(&self) -> Time {
@@ -497,7 +491,7 @@ mod tests {
     type Trace = Rc<RefCell<Vec<Record>>>;
 
     fn traced() -> (World<Scripted>, Trace) {
-        let mut world = World::empty();
+        let mut world = World::default();
         let trace = Trace::default();
         let sink = trace.clone();
         world.add_sink(move |record| sink.borrow_mut().push(*record));

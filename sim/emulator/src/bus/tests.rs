@@ -98,6 +98,10 @@ fn refs(nodes: &mut [Node]) -> Vec<&mut dyn BusNode> {
     each.collect()
 }
 
+fn port() -> Node {
+    Node::Port(HostPort::new(1_000_000))
+}
+
 fn sync() -> Frame {
     Frame::standard(0x080, &[]).unwrap()
 }
@@ -234,7 +238,7 @@ fn one_shot_without_acknowledge() {
 
 #[test]
 fn a_controller_joins_after_eleven_recessive_bits() {
-    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(0, 0), port()]);
     bench.run(10);
     assert_eq!(bench.read(0, 0x04) & 1, 1, "INAK");
     bench.run(11);
@@ -244,7 +248,7 @@ fn a_controller_joins_after_eleven_recessive_bits() {
     bench.write(0, 0x00, 0x1_0001);
     bench.run(20);
     assert_eq!(bench.read(0, 0x04) & 1, 1);
-    bench.nodes.push(Node::Port(HostPort::new(1_000_000)));
+    bench.nodes.push(port());
     bench.send(1, 30, boot_up());
     bench.send(1, 30, sync());
     bench.run(40);
@@ -262,7 +266,7 @@ fn a_controller_joins_after_eleven_recessive_bits() {
 
 #[test]
 fn a_controller_leaves_when_its_frame_is_over() {
-    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(0, 0), port()]);
     bench.run(20);
     bench.write(0, 0x180, 0x080 << 21 | 1);
     bench.run(30);
@@ -278,7 +282,7 @@ fn a_controller_leaves_when_its_frame_is_over() {
 #[test]
 fn overrun_on_the_bus() {
     for (rflm, kept) in [(0, [0x101, 0x102, 0x105]), (8, [0x101, 0x102, 0x103])] {
-        let mut bench = Bench::new(vec![controller(0, rflm), Node::Port(HostPort::new(1_000_000))]);
+        let mut bench = Bench::new(vec![controller(0, rflm), port()]);
         bench.run(20);
         (0x101..=0x105).for_each(|id| bench.send(1, 20, Frame::standard(id, &[]).unwrap()));
         bench.run(1000);
@@ -376,7 +380,7 @@ fn what_a_controller_tolerates_follows_from_its_bit_timing() {
 
 #[test]
 fn a_silent_node_neither_acknowledges_nor_disturbs() {
-    let mut bench = Bench::new(vec![controller(1 << 31, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(1 << 31, 0), port()]);
     bench.run(20);
     bench.send(1, 20, sync());
     bench.run(2_000);
@@ -394,7 +398,7 @@ fn a_silent_node_neither_acknowledges_nor_disturbs() {
 #[test]
 fn loop_back_receives_its_own_and_needs_no_acknowledge() {
     for (btr, on_the_wire) in [(1 << 30, 1), (3 << 30, 0)] {
-        let mut bench = Bench::new(vec![controller(btr, 0), Node::Port(HostPort::new(1_000_000))]);
+        let mut bench = Bench::new(vec![controller(btr, 0), port()]);
         bench.run(20);
         bench.write(0, 0x180, 0x123 << 21 | 1);
         bench.run(500);
@@ -410,7 +414,7 @@ fn loop_back_receives_its_own_and_needs_no_acknowledge() {
 
 #[test]
 fn bus_off_ends_after_128_times_11_recessive_bits() {
-    let mut bench = Bench::new(vec![controller(0, 0x40), Node::Port(HostPort::new(1_000_000))]); // ABOM
+    let mut bench = Bench::new(vec![controller(0, 0x40), port()]); // ABOM
     bench.run(20);
     let disturb = Fault {
         frames: FrameMatch { from: Some(0), ..FrameMatch::default() },
@@ -439,11 +443,7 @@ fn bus_off_ends_after_128_times_11_recessive_bits() {
 
 #[test]
 fn bus_off_recovery_counts_between_frames() {
-    let mut bench = Bench::new(vec![
-        controller(0, 0x40),
-        Node::Port(HostPort::new(1_000_000)),
-        Node::Port(HostPort::new(1_000_000)),
-    ]);
+    let mut bench = Bench::new(vec![controller(0, 0x40), port(), port()]);
     bench.run(20);
     let now = bench.bus.now();
     for _ in 0..32 {
@@ -502,7 +502,7 @@ fn injected_faults() {
 #[test]
 fn who_vanishes_leaves_a_bad_frame() {
     // The sender loses its power in the middle of its frame.
-    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(0, 0), port()]);
     bench.run(20);
     bench.write(0, 0x180, 0x080 << 21 | 1);
     bench.run(40);
@@ -525,12 +525,8 @@ fn who_vanishes_leaves_a_bad_frame() {
 fn steps_do_not_matter() {
     // The same traffic in one go and in steps of 1 us gives the same trace.
     let run = |step: u64| {
-        let mut bench = Bench::new(vec![
-            controller(0, 0x40),
-            Node::Port(HostPort::new(1_000_000)),
-            Node::Port(HostPort::new(500_000)),
-            Node::Port(HostPort::new(1_000_000)),
-        ]);
+        let mut bench =
+            Bench::new(vec![controller(0, 0x40), port(), Node::Port(HostPort::new(500_000)), port()]);
         let when = When::OneIn { frames: 3, seed: 5 };
         bench.bus.inject(Fault { frames: FrameMatch::default(), when, action: FaultAction::Disturb });
         for n in 0..60 {
@@ -571,8 +567,7 @@ fn request(bench: &mut Bench, n: usize) {
 }
 
 fn bench_with(node: Node) -> Bench {
-    let mut bench =
-        Bench::new(vec![node, Node::Port(HostPort::new(1_000_000)), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![node, port(), port()]);
     bench.run(100);
     bench
 }
@@ -592,7 +587,7 @@ fn who_has_no_pin_for_tx_is_not_heard_and_goes_bus_off() {
         bench.run(7_000);
         assert!(bench.received(2) == [(6_055, "701#00".into())], "node 2 acknowledges");
     }
-    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(0, 0), port()]);
     bench.run(100);
     bench.can(0).connect(Pins { rx: true, tx: false }, Time(100 * US));
     bench.send(1, 200, boot_up());
@@ -625,11 +620,7 @@ fn who_hears_nothing_is_synchronised_on_a_busy_bus() {
         (0x4000_0000, Pins::BOTH, false),
         (0x4000_0000, Pins::NONE, false),
     ] {
-        let mut bench = Bench::new(vec![
-            with_pins(btr, pins),
-            Node::Port(HostPort::new(1_000_000)),
-            Node::Port(HostPort::new(1_000_000)),
-        ]);
+        let mut bench = Bench::new(vec![with_pins(btr, pins), port(), port()]);
         bench.send(1, 0, boot_up());
         bench.run(20);
         assert_eq!(bench.read(0, 0x04) & 1, u32::from(hears), "{btr:08X} {pins:?}: INAK");
@@ -656,7 +647,7 @@ fn in_loop_back_mode_without_a_pin_it_plays_with_itself() {
 #[test]
 fn on_a_line_that_stays_dominant_a_receiver_ends_error_passive() {
     const EPVF_BOFF: u32 = 0b110;
-    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    let mut bench = Bench::new(vec![controller(0, 0), port()]);
     bench.run(1_000);
     bench.hold_dominant(true);
     bench.run(1_131);
@@ -736,7 +727,7 @@ fn a_controller_that_nobody_acknowledges_ends_error_passive_and_repeats() {
     let log = bench.log();
     assert!(log.iter().all(|(.., outcome)| *outcome == Outcome::Bad(ErrorKind::Acknowledge)));
     assert!(log[16..].windows(2).all(|pair| pair[1].0 - pair[0].0 == 65));
-    bench.nodes.push(Node::Port(HostPort::new(1_000_000)));
+    bench.nodes.push(port());
     bench.run(60_001_000);
     assert_eq!(bench.read(0, 0x18) >> 16, 127);
     assert_eq!(bench.received(1).len(), 1);

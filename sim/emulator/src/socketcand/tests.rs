@@ -2,36 +2,13 @@
 //! here looks at a clock; loops give up after so many turns.
 
 use super::*;
-use crate::bxcan::BxCan;
 use crate::time::{Span, Time};
 
 /// Turns of a millisecond or more after which something that should have happened never will.
 const TURNS: usize = 20_000;
 
-/// There are no machines in these tests.
-enum Nobody {}
-
-impl Computer for Nobody {
-    type Stop = ();
-    fn is_powered(&self) -> bool {
-        match *self {}
-    }
-    fn now(&self) -> Time {
-        match *self {}
-    }
-    fn run_until(&mut self, _deadline: Time) {
-        match *self {}
-    }
-    fn can(&mut self) -> &mut BxCan {
-        match *self {}
-    }
-    fn is_news(_stop: &()) -> bool {
-        false
-    }
-}
-
 struct Bench {
-    world: World<Nobody>,
+    world: World,
     server: Server,
     adapter: PortId,
     device: PortId,
@@ -39,7 +16,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let mut world = World::empty();
+        let mut world = World::new();
         let adapter = world.add_host_port(1_000_000);
         let device = world.add_host_port(1_000_000);
         Self { world, server: Server::bind("127.0.0.1:0", "can0").unwrap(), adapter, device }
@@ -53,7 +30,7 @@ impl Bench {
 
     /// One turn of the loop that a program with a server has.
     fn turn(&mut self) {
-        self.server.wait(Duration::from_millis(1));
+        thread::park_timeout(Duration::from_millis(1));
         self.server.exchange(&mut self.world, self.adapter);
         self.world.run_for(Span::from_millis(1));
         self.server.exchange(&mut self.world, self.adapter);

@@ -182,14 +182,8 @@ fn refuses_with_a_reason() {
 #[cfg(unix)]
 fn serves_clients_until_ctrl_c() {
     let image = program(&folder("clients"), "forever");
-    let mut child = Command::new(env!("CARGO_BIN_EXE_emulate"))
-        .args([&image, "--socketcand", "127.0.0.1:0", "-v"])
-        .stdout(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map_while(Result::ok);
-    let first = lines.next().unwrap();
-    let address = first.strip_prefix("clients reach the bus at socketcand://").unwrap();
+    let mut board = Running::start(&[&image, "--socketcand", "127.0.0.1:0", "-v"]);
+    let address = board.after("clients reach the bus at socketcand://");
     let address = address.strip_suffix("/can0").unwrap();
     let mut client = TcpStream::connect(address).unwrap();
     let mut buffer = [0; 64];
@@ -202,13 +196,10 @@ fn serves_clients_until_ctrl_c() {
     assert_eq!(ask(b"< open can0 >"), "< ok >");
     assert_eq!(ask(b"< send 123 1 AB >< rawmode >"), "< ok >");
     // The program does not use its CAN controller, so no node acknowledges.
-    let told = lines.by_ref().find(|line| line.contains("123#AB")).unwrap();
-    assert!(told.contains("no acknowledge"), "{told}");
-    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(killed.success());
-    let last = lines.last().unwrap();
+    let sent = board.line_with("123#AB");
+    assert!(sent.contains("no acknowledge"), "{sent}");
+    let last = board.interrupt();
     assert!(last.contains("end: 0 frames"), "{last}");
-    assert!(child.wait().unwrap().success());
 }
 
 #[test]
@@ -256,14 +247,13 @@ impl Running {
         lines.find(|line| line.contains(words)).unwrap()
     }
 
-    /// Ctrl-C, and the end.
-    fn interrupt(mut self) {
-        assert!(Command::new("kill")
-            .args(["-INT", &self.child.id().to_string()])
-            .status()
-            .unwrap()
-            .success());
+    /// Ctrl-C, and the end; returns the last line.
+    fn interrupt(mut self) -> String {
+        let killed = Command::new("kill").args(["-INT", &self.child.id().to_string()]).status().unwrap();
+        assert!(killed.success());
+        let last = self.lines.by_ref().map_while(Result::ok).last().unwrap();
         assert!(self.child.wait().unwrap().success());
+        last
     }
 }
 
@@ -351,7 +341,6 @@ fn the_flash_file_keeps_what_was_programmed() {
 }
 
 /// The output of gdb.
-#[cfg(feature = "gdb")]
 fn gdb(address: &str, commands: &[&str]) -> String {
     let mut gdb = Command::new("gdb-multiarch");
     gdb.args(["-nx", "-batch", "-ex", "set architecture arm", "-ex", &format!("target remote {address}")]);
@@ -368,7 +357,7 @@ fn gdb(address: &str, commands: &[&str]) -> String {
 /// gdb with breakpoints, steps, memory, registers, and a reset; the virtual time is stopped while
 /// the machine is halted.
 #[test]
-#[cfg(all(unix, feature = "gdb"))]
+#[cfg(unix)]
 fn gdb_stops_steps_looks_and_changes() {
     let image = program(&folder("gdb"), "counts");
     let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
@@ -435,13 +424,12 @@ fn gdb_stops_steps_looks_and_changes() {
 }
 
 /// A packet of gdb's protocol.
-#[cfg(feature = "gdb")]
 const NOISE: &[u8] = b"$#+-cmMgGsXZzvqk,;:0123456789abcdef\x03\xFF}*";
 
 /// While the machine is halted no time goes by. When a debugger disconnects at any point, the
 /// machine goes on. Invalid bytes do no harm.
 #[test]
-#[cfg(all(unix, feature = "gdb"))]
+#[cfg(unix)]
 fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
     let image = program(&folder("gdb-rubbish"), "counts");
     let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);

@@ -372,11 +372,29 @@ fn an_equal_priority_waits_and_follows() {
     assert_eq!(machine.counters().exceptions[16..18], [1, 1]);
 }
 
+/// Programs that write what they find, and the words by the manuals.
 #[test]
-fn basepri_and_primask_hold_back_and_primask_lets_wfi_end() {
-    let mut machine = machine(&programs::MASKS);
-    machine.run_until(ms(1));
-    assert_eq!(words(&machine, 6), [1, 9, 2, 3, 9, 4]);
+fn a_program_finds_what_the_manuals_say() {
+    for (program, until_ms, expected, why) in [
+        (&programs::MASKS, 1, &[1, 9, 2, 3, 9, 4][..], "BASEPRI and PRIMASK hold back, PRIMASK lets WFI end"),
+        (&programs::UNPRIVILEGED, 10, &[1_000, 1_000, 1], "without privilege masks hold, and do not change"),
+        (&programs::FAULTMASK, 1, &[0, 1], "an exception return clears FAULTMASK (DDI 0403E B1.5.8)"),
+        (&programs::VECTORS_IN_RAM, 1, &[77], "VTOR moves the table"),
+        // The first load from a page calls a hook in the middle of a block.
+        (
+            &programs::CONDITIONAL_LOADS,
+            1,
+            &[64 * 4],
+            "code after an IT block with a load stays unconditional",
+        ),
+        (&programs::BIT_BAND, 1, &[3, 1, 0x0010_0008, 1], "bit-band aliases reach their bits"),
+        (&programs::WRITES_ITS_OWN_CODE, 1, &[1, 2], "code that a program writes is seen"),
+    ] {
+        let mut machine = machine(program);
+        assert_eq!(machine.run_until(ms(until_ms)), Stop::Deadline, "{why}");
+        assert_eq!(words(&machine, expected.len() as u32), expected, "{why}");
+        assert_eq!(machine.reports(), [], "{why}");
+    }
 }
 
 /// DDI 0403E B1.5.6: the frame on the process stack, padded to eight bytes with bit 9 of the
@@ -394,13 +412,6 @@ fn svc_from_the_process_stack_and_back() {
     assert_eq!(log[5], 0, "CONTROL in the handler");
     assert_eq!(log[6], 11);
     assert_eq!(log[7..9], [2, 0x2000_8004], "CONTROL and SP in the thread again");
-}
-
-#[test]
-fn vtor_moves_the_table() {
-    let mut machine = machine(&programs::VECTORS_IN_RAM);
-    machine.run_until(ms(1));
-    assert_eq!(word(&machine, OUT), 77);
 }
 
 #[test]
@@ -423,15 +434,6 @@ fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
     assert!(word(&machine, OUT + 16) > 10_000, "ticks: {}", word(&machine, OUT + 16));
 }
 
-/// The first load from a page calls a hook in the middle of a block. If the load is within an IT
-/// block, the code after the IT block stays unconditional.
-#[test]
-fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
-    let mut machine = machine(&programs::CONDITIONAL_LOADS);
-    machine.run_until(ms(1));
-    assert_eq!(word(&machine, OUT), 64 * 4);
-}
-
 /// New code in flash is executed, also if the program had read the old code before executing it.
 #[test]
 fn code_that_was_read_before_it_was_run_can_be_replaced() {
@@ -442,21 +444,6 @@ fn code_that_was_read_before_it_was_run_can_be_replaced() {
         machine.run_until(ms(at));
         assert_eq!(word(&machine, OUT), u32::from(n));
     }
-}
-
-#[test]
-fn masks_hold_for_code_without_privilege_which_cannot_change_them() {
-    let mut machine = machine(&programs::UNPRIVILEGED);
-    assert_eq!(machine.run_until(ms(10)), Stop::Deadline);
-    assert_eq!(words(&machine, 3), [1_000, 1_000, 1]);
-}
-
-/// DDI 0403E B1.5.8: an exception return clears FAULTMASK.
-#[test]
-fn faultmask_ends_with_its_handler() {
-    let mut machine = machine(&programs::FAULTMASK);
-    machine.run_until(ms(1));
-    assert_eq!(words(&machine, 2), [0, 1]);
 }
 
 // --- FPU
@@ -719,14 +706,6 @@ fn without_its_crystal_the_board_never_gets_there() {
 // ------------------------------------------------------------------------------------------------------
 
 #[test]
-fn bit_band_aliases_reach_their_bits() {
-    let mut machine = machine(&programs::BIT_BAND);
-    machine.run_until(ms(1));
-    assert_eq!(words(&machine, 4), [0x0000_0003, 1, 0x0010_0008, 1]);
-    assert_eq!(machine.reports(), []);
-}
-
-#[test]
 fn unmodelled_and_unclocked_accesses_are_reported_once_with_a_count() {
     let mut machine = machine(&programs::PERIPHERALS);
     put(&mut machine, OUT + 4, 5);
@@ -741,13 +720,6 @@ fn unmodelled_and_unclocked_accesses_are_reported_once_with_a_count() {
     assert_eq!(machine.reports().iter().map(|r| r.count).sum::<u64>(), 6);
     assert!(machine.pin('D', 12));
     assert_eq!(word(&machine, OUT), 1 << 12, "IDR sees the pin");
-}
-
-#[test]
-fn self_written_code_is_seen() {
-    let mut machine = machine(&programs::WRITES_ITS_OWN_CODE);
-    machine.run_until(ms(1));
-    assert_eq!(words(&machine, 2), [1, 2]);
 }
 
 #[test]

@@ -88,7 +88,6 @@ struct Args {
 
     /// Let gdb in at this address (`target remote HOST:PORT`). While it has halted the board, time
     /// stands still
-    #[cfg(feature = "gdb")]
     #[arg(long, value_name = "HOST:PORT", conflicts_with = "node_count")]
     gdb: Option<String>,
 
@@ -241,10 +240,10 @@ fn run(args: &Args) -> Result<()> {
     bench.power_on()?;
     let outcome = bench.live(args, &end);
     // The report and the files are written even if an error occurred.
-    let told = bench.print_report();
+    let printed = bench.print_report();
     let flushed = bench.flush();
     let kept = bench.keep_flash();
-    outcome.and(told).and(flushed).and(kept)?;
+    outcome.and(printed).and(flushed).and(kept)?;
     bench.sum_up()
 }
 
@@ -318,12 +317,11 @@ struct Bench {
     server: Option<Server>,
     serial: Option<Serial>,
     control: control::Server,
-    #[cfg(feature = "gdb")]
     gdb: Option<emulator::gdb::Door>,
     flash: Option<FlashFile>,
     trace: Option<(PathBuf, Handle<BufWriter<File>>)>,
     /// The messages that are not printed yet, with their times.
-    said: Rc<RefCell<Vec<(Time, String)>>>,
+    unprinted: Rc<RefCell<Vec<(Time, String)>>>,
 }
 
 /// A board, how many of its reports have been shown, and the messages that it writes for a debug
@@ -333,8 +331,8 @@ struct Watched {
     shown: usize,
     sram: Region,
     log: rtt::Reader,
-    /// The time of the next look at its RAM.
-    look: Time,
+    /// When its RAM is searched for messages next.
+    poll: Time,
     /// The incomplete lines that its USARTs have sent, by name and bit rate.
     serial: BTreeMap<(&'static str, u32), Vec<u8>>,
 }
@@ -345,7 +343,7 @@ const LONGEST_LINE: usize = 256;
 impl Watched {
     /// The text that its USARTs have sent since the last call, with the time of its end.
     fn serial(&mut self, machine: &mut Machine) -> Vec<(Time, String)> {
-        let mut said = Vec::new();
+        let mut lines = Vec::new();
         for usart in machine.usarts_mut() {
             let name = usart.instance().name;
             for Character { end, byte, bit_rate } in usart.take_sent() {
@@ -356,22 +354,20 @@ impl Watched {
                 }
                 let text = String::from_utf8_lossy(line).trim_end().escape_default().to_string();
                 line.clear();
-                said.push((end, format!("{name} ({bit_rate} bit/s): {text}")));
+                lines.push((end, format!("{name} ({bit_rate} bit/s): {text}")));
             }
         }
-        said
+        lines
     }
 }
 
 /// Steps that a debugger gets before the others are looked after.
-#[cfg(feature = "gdb")]
 const STEPS: usize = 100;
 /// How long a step may take before it waits for the wall clock as everything does.
-#[cfg(feature = "gdb")]
 const STEP: Span = Span::from_micros(10);
 
 /// How often a board's RAM is looked at for what it reports to a debug probe.
-const LOOK: Span = Span::from_millis(5);
+const POLL: Span = Span::from_millis(5);
 
 impl Bench {
     fn new(args: &Args) -> Result<Self> {
@@ -412,7 +408,7 @@ impl Bench {
                 shown: 0,
                 sram: args.board.chip.sram,
                 log: rtt::Reader::with(decoder(args)?),
-                look: Time(0),
+                poll: Time(0),
                 serial: BTreeMap::new(),
             });
         }
@@ -427,8 +423,8 @@ impl Bench {
                 Some((path.clone(), log))
             }
         };
-        let said = Rc::new(RefCell::new(Vec::new()));
-        let (mut words, telling, verbose) = (words::Words::default(), said.clone(), args.verbose);
+        let unprinted = Rc::new(RefCell::new(Vec::new()));
+        let (mut words, messages, verbose) = (words::Words::default(), unprinted.clone(), args.verbose);
         world.add_sink(move |record| {
             let text = words.of(record);
             let frame = match record.outcome {
@@ -436,8 +432,7 @@ impl Bench {
                 Outcome::KeptBack if verbose => Some(format!("{} (kept back)", record.frame)),
                 _ => None,
             };
-            let mut said = telling.borrow_mut();
-            said.extend(frame.into_iter().chain(text).map(|text| (record.end, text)));
+            messages.borrow_mut().extend(frame.into_iter().chain(text).map(|text| (record.end, text)));
         });
         Ok(Self {
             world,
@@ -446,11 +441,10 @@ impl Bench {
             server: None,
             serial: None,
             control: control::Server::new(),
-            #[cfg(feature = "gdb")]
             gdb: None,
             flash,
             trace,
-            said,
+            unprinted,
         })
     }
 
@@ -482,7 +476,6 @@ impl Bench {
         if io::stdin().is_terminal() && io::stdout().is_terminal() {
             self.control.read_terminal().context("reading the terminal")?;
         }
-        #[cfg(feature = "gdb")]
         if let Some(address) = &args.gdb {
             let door = emulator::gdb::Door::bind(address.as_str());
             let door = door.with_context(|| format!("cannot listen at {address}"))?;
@@ -550,8 +543,8 @@ impl Bench {
                     awake_until = Instant::now() + AWAKE;
                 }
             }
-            if let Some(text) = lag.look(wall, now) {
-                self.said.borrow_mut().push((now, text));
+            if let Some(text) = lag.check(wall, now) {
+                self.unprinted.borrow_mut().push((now, text));
             }
             self.obey()?;
             self.print_report()?;
@@ -573,7 +566,7 @@ impl Bench {
         if let Some(server) = &mut self.server {
             delivered += server.exchange(&mut self.world, self.port);
             let now = self.world.now();
-            self.said.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
+            self.unprinted.borrow_mut().extend(server.notices().into_iter().map(|notice| (now, notice)));
         } else {
             // These frames have no receiver.
             while self.world.receive(self.port).is_some() {}
@@ -584,11 +577,7 @@ impl Bench {
         delivered > 0
     }
 
-    #[cfg(not(feature = "gdb"))]
-    fn debug(&mut self) {}
-
     /// Lets gdb take part. A step does not wait for the wall clock.
-    #[cfg(feature = "gdb")]
     fn debug(&mut self) {
         let Some(door) = &mut self.gdb else { return };
         let board = self.boards[0].id;
@@ -601,7 +590,7 @@ impl Bench {
             self.world.run_for(STEP);
         }
         let now = self.world.now();
-        self.said.borrow_mut().extend(door.notices().into_iter().map(|notice| (now, notice)));
+        self.unprinted.borrow_mut().extend(door.notices().into_iter().map(|notice| (now, notice)));
     }
 
     /// Carries out the requests of the control socket and the terminal.
@@ -613,7 +602,7 @@ impl Bench {
             let failed = outcome.as_ref().err().map(|error| format!("{error:#}"));
             request.answer(outcome.map_err(|error| format!("{error:#}")));
             if let Some(text) = failed {
-                self.said.borrow_mut().push((self.world.now(), format!("a command failed: {text}")));
+                self.unprinted.borrow_mut().push((self.world.now(), format!("a command failed: {text}")));
             }
         }
         Ok(())
@@ -630,7 +619,7 @@ impl Bench {
             Action::TogglePower => !on,
             Action::Supply { .. } | Action::Reset | Action::Pin { .. } | Action::Status => on,
         };
-        let said = match action {
+        let done = match action {
             Action::Power(_) | Action::TogglePower if on => {
                 self.world.power_on(id);
                 Some("power on".to_owned())
@@ -660,9 +649,9 @@ impl Bench {
             Action::Status => None,
         };
         let now = self.world.now();
-        if let Some(text) = said {
+        if let Some(text) = done {
             let line = format!("{}: {text}", self.name(board));
-            self.said.borrow_mut().push((now, line));
+            self.unprinted.borrow_mut().push((now, line));
             return Ok(text);
         }
         let machine = self.world.machine(id);
@@ -686,7 +675,7 @@ impl Bench {
 
     /// Prints the events since the last call, in their order in time.
     fn print_report(&mut self) -> Result<()> {
-        let mut lines = std::mem::take(&mut *self.said.borrow_mut());
+        let mut lines = std::mem::take(&mut *self.unprinted.borrow_mut());
         while let Some(news) = self.world.news() {
             let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
             if let Some(text) = happened(news.stop, || self.world.machine(news.machine).fault_cause()) {
@@ -706,10 +695,10 @@ impl Bench {
                     .into_iter()
                     .map(|(at, line)| (at, format!("{name}: {line}"))),
             );
-            if now >= board.look {
-                board.look = now + LOOK;
-                let told = board.log.lines(self.world.machine_mut(board.id), board.sram);
-                lines.extend(told.into_iter().map(|line| (now, format!("{name}: log: {line}"))));
+            if now >= board.poll {
+                board.poll = now + POLL;
+                let logged = board.log.lines(self.world.machine_mut(board.id), board.sram);
+                lines.extend(logged.into_iter().map(|line| (now, format!("{name}: log: {line}"))));
             }
         }
         lines.sort_by_key(|(at, _)| *at);
