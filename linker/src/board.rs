@@ -64,13 +64,13 @@ pub fn named(word: &str) -> Result<&'static Layout, NamedError> {
     if !is_file(word) {
         return layout::by_name(word).ok_or_else(|| NamedError::Unknown(word.to_owned()));
     }
-    let told = |error: &dyn std::fmt::Display| NamedError::File(word.to_owned(), error.to_string());
+    let unreadable = |error: &dyn std::fmt::Display| NamedError::File(word.to_owned(), error.to_string());
     let mut bytes = Vec::new();
     // It may be a pipe, which may never end.
     File::open(Path::new(word))
         .and_then(|file| file.take(MAX as u64 + 1).read_to_end(&mut bytes))
-        .map_err(|error| told(&error))?;
-    parse(&String::from_utf8_lossy(&bytes)).map_err(|error| told(&error))
+        .map_err(|error| unreadable(&error))?;
+    parse(&String::from_utf8_lossy(&bytes)).map_err(|error| unreadable(&error))
 }
 
 /// An error in a memory map.

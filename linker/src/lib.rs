@@ -262,21 +262,21 @@ mod tests {
     #[test]
     fn what_cannot_be_is_told_in_words() {
         let folder = folder("wrong");
-        let told = |application: Application| application.write(&folder).unwrap_err().to_string();
-        let text = told(Application::of_board("stm32f407g-disc2"));
+        let refusal = |application: Application| application.write(&folder).unwrap_err().to_string();
+        let text = refusal(Application::of_board("stm32f407g-disc2"));
         assert!(
             text.contains("no board \"stm32f407g-disc2\"") && text.contains("stm32f429i-disc1"),
             "{text}"
         );
         for number in [0, 2, 255] {
-            let text = told(Application::of_board("stm32f407g-disc1").program(number));
+            let text = refusal(Application::of_board("stm32f407g-disc1").program(number));
             assert!(text.contains(&format!("no program {number}")), "{text}");
         }
         let missing = folder.join("none.toml");
-        assert!(told(Application::of_file(&missing)).contains("none.toml"));
+        assert!(refusal(Application::of_file(&missing)).contains("none.toml"));
         let rubbish = folder.join("rubbish.toml");
         fs::write(&rubbish, "board = [").unwrap();
-        let text = told(Application::of_file(&rubbish));
+        let text = refusal(Application::of_file(&rubbish));
         assert!(text.contains("rubbish.toml: line 1"), "{text}");
         fs::remove_dir_all(folder).unwrap();
     }

@@ -12,7 +12,7 @@ pub struct Args {
     /// The words before `--`.
     own: Arguments,
     /// `--` and the words after it, for another program.
-    behind: Vec<String>,
+    passed_on: Vec<String>,
 }
 
 impl Args {
@@ -20,8 +20,8 @@ impl Args {
     pub fn new(words: impl Iterator<Item = String>) -> Self {
         let mut own: Vec<String> = words.collect();
         let split = own.iter().position(|word| word == "--").unwrap_or(own.len());
-        let behind = own.split_off(split);
-        Self { own: Arguments::from_vec(own.into_iter().map(Into::into).collect()), behind }
+        let passed_on = own.split_off(split);
+        Self { own: Arguments::from_vec(own.into_iter().map(Into::into).collect()), passed_on }
     }
 
     /// Takes a flag, with a short name or without one; returns whether it was there.
@@ -45,14 +45,14 @@ impl Args {
     }
 
     /// All words that were not taken, for the program that the job starts.
-    pub fn rest(self) -> Vec<String> {
+    pub fn remaining(self) -> Vec<String> {
         let own = self.own.finish().into_iter().map(|word| word.to_string_lossy().into_owned());
-        own.chain(self.behind).collect()
+        own.chain(self.passed_on).collect()
     }
 
     /// Checks that all words were taken, for a job that passes none on.
     pub fn none_left(self) -> Outcome {
-        match self.rest().first() {
+        match self.remaining().first() {
             None => Ok(()),
             Some(word) => Err(format!("\"{word}\" is not understood here; --help lists the options.")),
         }
@@ -75,14 +75,14 @@ mod tests {
         assert_eq!(args.value("--trace"), Ok(None));
         assert!(args.flag("--yes"));
         assert!(!args.flag("--yes"));
-        assert_eq!(args.rest(), ["-p", "canopen", "sdo", "--", "--board", "kept", "--nocapture"]);
+        assert_eq!(args.remaining(), ["-p", "canopen", "sdo", "--", "--board", "kept", "--nocapture"]);
     }
 
     #[test]
     fn an_equals_sign_will_do_and_a_longer_name_is_another_option() {
         let mut args = args("--board=a=b --boards c");
         assert_eq!(args.value("--board"), Ok(Some("a=b".into())));
-        assert_eq!(args.rest(), ["--boards", "c"]);
+        assert_eq!(args.remaining(), ["--boards", "c"]);
     }
 
     #[test]

@@ -94,7 +94,7 @@ pub fn run(args: Args) -> Outcome {
     let metadata = process::metadata()?;
     let packages = packages(&metadata)?;
     let mut broken = broken_arrows(&packages);
-    broken.extend(ordered::broken(&metadata)?);
+    broken.extend(ordered::broken()?);
     if !packages.iter().any(|package| package.name == EMULATOR) {
         return Err(format!("the workspace has no crate \"{EMULATOR}\"."));
     }

@@ -1,7 +1,5 @@
 //! `cargo xtask attack`: the standing attacker of the bus, and the main scenarios on drawn chips.
 
-use std::path::Path;
-
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT as TWO;
 use shared_abi::layout::DEFAULT;
 
@@ -35,13 +33,9 @@ pub fn run(mut args: Args) -> Outcome {
     let record = if silicon.is_some() { "silicon" } else { "attacker" };
     setup::prepare(&[Part::Firmware, Part::Emulator])?;
     build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
-    evidence::begin(record)?;
     let mut attack = build::tests_program(DEFAULT, "attack");
     for (option, value) in [("--frames", frames), ("--seed", seed), ("--silicon", silicon)] {
         attack.args(value.map(|value| [option.to_owned(), value]).into_iter().flatten());
     }
-    let run = |file: &Path| process::run(attack.arg("--evidence").arg(file));
-    let (facts, ended) = evidence::facts_of(record, run)?;
-    evidence::record(record, facts)?;
-    ended
+    evidence::of_program(record, |file| process::run(attack.arg("--evidence").arg(file)))
 }

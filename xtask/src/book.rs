@@ -42,8 +42,8 @@ pub fn run(args: Args) -> Outcome {
     gather(&copy)?;
     let mut build = Command::new(mdbook);
     build.arg("build").arg("--dest-dir").arg(&book).arg(&copy);
-    let said = process::messages(&mut build)?;
-    refuse("mdBook", &warnings(&said))?;
+    let output = process::messages(&mut build)?;
+    refuse("mdBook", &warnings(&output))?;
     println!("{}", workspace::shown(&book.join("index.html")));
     Ok(())
 }
@@ -87,9 +87,9 @@ fn from_the_root(summary: &str) -> String {
 }
 
 /// The warnings and errors in mdBook's output.
-fn warnings(said: &str) -> Vec<String> {
+fn warnings(output: &str) -> Vec<String> {
     let is_good = |line: &str| line.trim_start().starts_with("INFO") || line.trim().is_empty();
-    said.lines().filter(|line| !is_good(line)).map(str::to_owned).collect()
+    output.lines().filter(|line| !is_good(line)).map(str::to_owned).collect()
 }
 
 #[cfg(test)]
@@ -113,8 +113,9 @@ mod tests {
     /// Lines as mdBook 0.5 prints them.
     #[test]
     fn what_mdbook_warns_of_is_told() {
-        let said = " INFO Book building has started\n WARN unclosed HTML tag `<n>` found in `docs/a.md`\n\n";
-        assert_eq!(warnings(said), [" WARN unclosed HTML tag `<n>` found in `docs/a.md`"]);
+        let output =
+            " INFO Book building has started\n WARN unclosed HTML tag `<n>` found in `docs/a.md`\n\n";
+        assert_eq!(warnings(output), [" WARN unclosed HTML tag `<n>` found in `docs/a.md`"]);
         assert!(warnings(" INFO Running the html backend\n").is_empty());
     }
 }

@@ -179,7 +179,7 @@ pub fn run(mut args: Args) -> Outcome {
     let every = args.flag("--all");
     let product = args.value("--product")?.map(|word| Product::chosen(&word)).transpose()?;
     let product = product.filter(|product| !product.is_default());
-    let words = args.rest();
+    let words = args.remaining();
     let names = match words.as_slice() {
         [] if every => all(board),
         [] => MAIN.to_vec(),
@@ -326,8 +326,8 @@ pub const C_APPLICATION: &str = "app-c";
 
 /// The linker of the Rust toolchain, which also links the rest of the firmware.
 fn lld() -> Outcome<PathBuf> {
-    let said = process::output(Command::new("rustc").args(["--version", "--verbose"]))?;
-    let host = said.lines().find_map(|line| line.strip_prefix("host: ")).unwrap_or_default();
+    let version = process::output(Command::new("rustc").args(["--version", "--verbose"]))?;
+    let host = version.lines().find_map(|line| line.strip_prefix("host: ")).unwrap_or_default();
     let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
     let tools = Path::new(sysroot.trim()).join("lib/rustlib").join(host).join("bin/gcc-ld");
     Ok(tools.join(format!("ld.lld{}", std::env::consts::EXE_SUFFIX)))

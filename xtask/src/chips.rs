@@ -19,7 +19,7 @@ ones 20 seconds: half an hour for all on two cores. So this is a job of its own 
 ";
 
 pub fn run(args: Args) -> Outcome {
-    let names = args.rest();
+    let names = args.remaining();
     let chips = match names.as_slice() {
         [] => kinds(),
         names => names

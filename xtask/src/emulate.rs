@@ -34,7 +34,7 @@ pub fn run(mut args: Args) -> Outcome {
     let word = args.value("--board")?.unwrap_or_else(|| layout::DEFAULT.board.to_owned());
     let log = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
     let virtual_can = args.flag("--virtual-can");
-    let options = args.rest();
+    let options = args.remaining();
     let has = |name: &str| options.iter().any(|word| word.split('=').next() == Some(name));
 
     let mut emulator = process::cargo("run --package coboot-emulator --bin emulate -- --board");

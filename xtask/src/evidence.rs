@@ -108,6 +108,14 @@ pub fn facts_of(name: &str, run: impl FnOnce(&Path) -> Outcome) -> Outcome<(Valu
     Ok((process::json(&files::text(&file)?)?, ended))
 }
 
+/// The same for a job that is one program: its facts are the record.
+pub fn of_program(name: &str, run: impl FnOnce(&Path) -> Outcome) -> Outcome {
+    begin(name)?;
+    let (facts, ended) = facts_of(name, run)?;
+    record(name, facts)?;
+    ended
+}
+
 /// The commit that is checked out, `unknown` outside a clone; and whether nothing was changed since.
 fn sources() -> (String, bool) {
     match process::git(&["rev-parse", "HEAD"]) {

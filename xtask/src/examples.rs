@@ -39,7 +39,7 @@ const TEMPLATE: &str = "template";
 const GENERATE: &str = "0.23.7";
 
 pub fn run(args: Args) -> Outcome {
-    let chosen = args.rest();
+    let chosen = args.remaining();
     let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
     if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
         return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));

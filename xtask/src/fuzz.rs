@@ -66,8 +66,8 @@ fn replay_all(targets: &[String]) -> Outcome {
         program.arg(unpack(target, kept)?);
         let found = found(target);
         program.args(found.is_dir().then_some(found));
-        let said = process::output(&mut program)?;
-        println!("  {target:<16} {:>10} inputs, no fault", said.trim());
+        let output = process::output(&mut program)?;
+        println!("  {target:<16} {:>10} inputs, no fault", output.trim());
     }
     Ok(())
 }
@@ -206,16 +206,16 @@ fn fuzz(cargo_fuzz: &Path, target: &str, end: &str) -> Outcome<Value> {
     let started = Instant::now();
     command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
     let status = command.status().map_err(|error| process::not_started(&command, &error))?;
-    let said = fs::read(&log).unwrap_or_default();
-    let said = String::from_utf8_lossy(&said);
-    let runs = runs(&said).filter(|runs| status.success() && *runs > 0);
+    let output = fs::read(&log).unwrap_or_default();
+    let output = String::from_utf8_lossy(&output);
+    let runs = runs(&output).filter(|runs| status.success() && *runs > 0);
     if let Some(runs) = runs {
         let seconds = started.elapsed().as_secs();
         println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
         return Ok(json!({"target": target, "inputs": runs, "seconds": seconds}));
     }
     let words = if status.success() { "ran no input" } else { "FAILED" };
-    println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
+    println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&output));
     Ok(json!({"target": target}))
 }
 
@@ -231,15 +231,15 @@ fn target_dir() -> PathBuf {
 }
 
 /// The number of inputs in the fuzzer's output.
-fn runs(said: &str) -> Option<u64> {
-    said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
+fn runs(output: &str) -> Option<u64> {
+    output.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
 }
 
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
 /// the input.
-fn excerpt(said: &str) -> String {
+fn excerpt(output: &str) -> String {
     let begin = ["panicked at", "ERROR: libFuzzer"];
-    let lines = said.lines().skip_while(|line| !begin.iter().any(|words| line.contains(words)));
+    let lines = output.lines().skip_while(|line| !begin.iter().any(|words| line.contains(words)));
     let (text, rest): (Vec<_>, Vec<_>) = lines.enumerate().partition(|(number, _)| *number < 8);
     let input = rest.into_iter().filter(|(_, line)| line.contains("Test unit written to"));
     text.into_iter().chain(input).map(|(_, line)| format!("    {line}\n")).collect()
@@ -278,12 +278,12 @@ mod tests {
     /// Lines as libFuzzer prints them.
     #[test]
     fn the_fuzzers_words_are_understood() {
-        let said = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
-        assert_eq!((runs(said), excerpt(said)), (Some(918_484), String::new()));
-        let said = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
+        let output = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
+        assert_eq!((runs(output), excerpt(output)), (Some(918_484), String::new()));
+        let output = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
                     Test unit written to crash-1\n";
-        assert_eq!(runs(said), None);
-        let excerpt = excerpt(said);
+        assert_eq!(runs(output), None);
+        let excerpt = excerpt(output);
         assert!(excerpt.contains("no room") && excerpt.contains("crash-1") && !excerpt.contains("seed"));
     }
 

@@ -45,7 +45,7 @@ pub fn run(mut args: Args) -> Outcome {
     let program = setup::tool("cargo-mutants", VERSION, &[])?;
     let folder = workspace::target_dir().join("mutants");
     files::make(&folder)?;
-    let mut options = args.rest();
+    let mut options = args.remaining();
     // A choice of files or lines is no result of a commit.
     let is_result = options.is_empty() && base.is_none();
     options.extend(shard.iter().map(|shard| format!("--shard={shard}")));

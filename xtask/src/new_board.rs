@@ -31,7 +31,7 @@ pub fn run(mut args: Args) -> Outcome {
         led: args.value("--led")?,
         strap: args.value("--strap")?,
     };
-    let mut words = args.rest().into_iter();
+    let mut words = args.remaining().into_iter();
     let (Some(name), None) = (words.next(), words.next()) else {
         return Err("one NAME is needed, and nothing else; --help says more.".into());
     };

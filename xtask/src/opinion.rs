@@ -1,7 +1,5 @@
 //! `cargo xtask opinion`: the emulated CPU and board beside ones that others wrote.
 
-use std::path::Path;
-
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
@@ -27,11 +25,7 @@ pub fn run(args: Args) -> Outcome {
 fn cpu() -> Outcome {
     let mut test = process::cargo("test --quiet --package coboot-emulator --test it");
     test.args("-- second_opinion:: --include-ignored --nocapture --test-threads=1".split(' '));
-    evidence::begin("cpu")?;
-    let run = |file: &Path| process::run(test.env("COBOOT_CPU_EVIDENCE", file));
-    let (facts, ended) = evidence::facts_of("cpu", run)?;
-    evidence::record("cpu", facts)?;
-    ended
+    evidence::of_program("cpu", |file| process::run(test.env("COBOOT_CPU_EVIDENCE", file)))
 }
 
 fn board() -> Outcome {

@@ -2,12 +2,9 @@
 //! crates and functions that must not be lost when the rest is moved.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
-
-use serde_json::Value;
+use std::path::PathBuf;
 
 use crate::modules::without_comments;
-use crate::process::list;
 use crate::workspace::{self, TARGET};
 use crate::{files, outcome::Outcome, process};
 
@@ -21,7 +18,7 @@ const RX_INTERRUPTS: [&str; 4] = ["CAN1_RX0", "CAN1_RX1", "CAN2_RX0", "CAN2_RX1"
 const IN_THE_IMAGE: [&str; 7] =
     ["rtic", "stm32f4xx-hal", "bxcan", "cortex-m", "heapless", "crc", "panic-probe"];
 /// Code that is there: the words for it, a file, and pieces of that file.
-const CODE: [(&str, &str, &[&str]); 5] = [
+const CODE: [(&str, &str, &[&str]); 6] = [
     ("warm-start cell", "shared-abi/src/warm_start.rs", &["pub struct Cell"]),
     ("vector relocation", "shared-abi/src/vectors.rs", &["0xE000_ED08"]),
     ("callgate", "shared-abi/src/callgate.rs", &["pub struct Table"]),
@@ -31,41 +28,33 @@ const CODE: [(&str, &str, &[&str]); 5] = [
         &["fn start_bootloader(", "self.start_bootloader("],
     ),
     ("host test of the ABI", "tests/abi/main.rs", &["mod layout;", "mod header;", "mod reentry;"]),
+    ("test program of the ABI", "tests/kit/Cargo.toml", &["path = \"../abi/main.rs\""]),
 ];
 
 /// The parts of the repository that the orders are about.
 #[derive(Default)]
 struct House {
-    /// The files at and below the top-level paths, by their paths: the text of Rust sources, without
+    /// The files at and below the top-level paths, by their paths: the text of Rust sources and manifests, without
     /// comments, and nothing of the others.
     files: BTreeMap<PathBuf, String>,
     /// The crates that the image of the bootloader contains.
     image: BTreeSet<String>,
-    /// The names of the test programs, with their sources.
-    tests: Vec<(String, PathBuf)>,
 }
 
 /// The orders that are not kept, as messages.
-pub fn broken(metadata: &Value) -> Outcome<Vec<String>> {
+pub fn broken() -> Outcome<Vec<String>> {
     let root = workspace::root();
-    let from_the_root = |file: &Path| file.strip_prefix(root).unwrap_or(file).to_owned();
     let mut house = House::default();
     for path in TOP_LEVEL.map(|path| root.join(path)) {
         let files = if path.is_dir() { files::below(&path, &[])? } else { vec![path] };
         for file in files.iter().filter(|file| file.exists()) {
-            let is_source = files::is(file, "rs");
+            let is_source = files::is(file, "rs") || files::is(file, "toml");
             let text = if is_source { without_comments(&files::text(file)?) } else { String::new() };
-            house.files.insert(from_the_root(file), text);
+            house.files.insert(file.strip_prefix(root).unwrap_or(file).to_owned(), text);
         }
     }
     let tree = process::tree(&["--package", "bootloader", "--target", TARGET, "--edges", "normal"])?;
     house.image = tree.iter().filter_map(|krate| Some(krate.split(' ').next()?.to_owned())).collect();
-    let targets = list(metadata, "packages").flat_map(|package| list(package, "targets"));
-    for target in targets.filter(|target| list(target, "kind").any(|kind| kind == "test")) {
-        if let (Some(name), Some(source)) = (target["name"].as_str(), target["src_path"].as_str()) {
-            house.tests.push((name.to_owned(), from_the_root(Path::new(source))));
-        }
-    }
     Ok(house.broken())
 }
 
@@ -92,8 +81,6 @@ impl House {
             let is_there = self.has(file, |text| pieces.iter().all(|piece| text.contains(piece)));
             order(is_there, format!("{file}: there is no {what} (`{}`)", pieces.join("`, `")));
         }
-        let is_abi = |(name, source): &(String, PathBuf)| name == "abi" && source.starts_with("tests");
-        order(self.tests.iter().any(is_abi), "tests: there is no test program `abi`".to_owned());
         broken
     }
 
@@ -115,6 +102,8 @@ fn has_receiving_task(source: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     const APP: &str = "systick_monotonic!(Mono, 1_000);\n#[rtic::app(device = pac)]\nmod app {\n\
@@ -122,29 +111,23 @@ mod tests {
                        #[task(binds = CAN1_TX, priority = 3)]\nfn protocol() {}\n}";
 
     fn house() -> House {
-        let mut house = House::default();
-        let mut put = |path: &str, text: String| house.files.insert(path.into(), text);
+        let mut house = House { image: IN_THE_IMAGE.map(str::to_owned).into(), ..House::default() };
+        let mut put = |path: &str, text: &str| house.files.insert(path.into(), text.to_owned());
         for file in ["Cargo.toml", "linker/application.x", "tests/Cargo.toml"] {
-            put(file, String::new());
+            put(file, "");
         }
         for program in PROGRAMS {
-            put(&format!("{program}/src/main.rs"), APP.to_owned());
+            put(&format!("{program}/src/main.rs"), APP);
         }
         for (_, file, pieces) in CODE {
-            put(file, pieces.join("\n"));
+            put(file, &pieces.join("\n"));
         }
-        house.image = IN_THE_IMAGE.map(str::to_owned).into();
-        house.tests = vec![("abi".to_owned(), "tests/abi/main.rs".into())];
         house
     }
 
     #[test]
-    fn a_house_with_everything_keeps_the_orders() {
-        assert_eq!(house().broken(), Vec::<String>::new());
-    }
-
-    #[test]
     fn each_thing_that_is_missing_is_named() {
+        assert_eq!(house().broken(), Vec::<String>::new());
         for (file, says) in [
             ("Cargo.toml", "no Cargo.toml"),
             ("linker/application.x", "no linker"),
@@ -153,6 +136,7 @@ mod tests {
             ("shared-abi/src/callgate.rs", "no callgate"),
             ("app-template/src/objects.rs", "no callback of 1F51h"),
             ("tests/abi/main.rs", "no host test of the ABI"),
+            ("tests/kit/Cargo.toml", "no test program of the ABI"),
         ] {
             let mut house = house();
             house.files.remove(Path::new(file));
@@ -164,22 +148,19 @@ mod tests {
             house.image.remove(krate);
             assert_eq!(house.broken(), [format!("bootloader: its image does not contain {krate}")]);
         }
-        for tests in [vec![], vec![("abi".to_owned(), "shared-abi/tests/abi.rs".into())]] {
-            let broken = House { tests, ..house() }.broken();
-            assert!(broken.len() == 1 && broken[0].contains("test program `abi`"), "{broken:?}");
-        }
     }
 
     #[test]
     fn a_program_without_its_task_or_its_timer_is_named() {
-        let with = |program: &str, from: &str, to: &str| {
+        let with = |file: &str, from: &str, to: &str| {
             let mut house = house();
-            let file = house.files.get_mut(&Path::new(program).join("src/main.rs")).unwrap();
-            assert!(file.contains(from), "{from}");
-            *file = without_comments(&file.replace(from, to));
+            let text = house.files.get_mut(Path::new(file)).unwrap();
+            assert!(text.contains(from), "{from}");
+            *text = without_comments(&text.replace(from, to));
             house.broken()
         };
         for program in PROGRAMS {
+            let file = format!("{program}/src/main.rs");
             for (from, to, says) in [
                 ("binds = CAN1_RX0, ", "", "no RTIC task"),
                 ("CAN1_RX0", "CAN1_SCE", "no RTIC task"),
@@ -187,16 +168,14 @@ mod tests {
                 ("#[rtic::app(device = pac)]", "", "no RTIC task"),
                 ("systick_monotonic!(", "// systick_monotonic!(", "no timer monotonic"),
             ] {
-                let broken = with(program, from, to);
+                let broken = with(&file, from, to);
                 assert!(broken.len() == 1 && broken[0].contains(says), "{program}, {from}: {broken:?}");
                 assert!(broken[0].starts_with(program), "{broken:?}");
             }
-            assert_eq!(with(program, "CAN1_RX0", "CAN2_RX0"), Vec::<String>::new());
+            assert_eq!(with(&file, "CAN1_RX0", "CAN2_RX0"), Vec::<String>::new());
         }
         // A callback that nobody calls is none.
-        let mut house = house();
         let (_, file, pieces) = CODE[3];
-        house.files.insert(file.into(), pieces[0].to_owned());
-        assert!(house.broken()[0].contains("that is called"));
+        assert!(with(file, pieces[1], "")[0].contains("that is called"));
     }
 }

@@ -158,15 +158,15 @@ pub const PRODUCT: Product = Product {{
 /// The size in a board's flash of the bootloader of this product, in bytes; an error if it is over the
 /// budget.
 fn size(board: &Layout, fields: &[&Choice], row: &[u8], product: &Product) -> Outcome<u32> {
-    let told = |problem: String| format!("{}, {}: {problem}", board.board, words(fields, row));
+    let named = |problem: String| format!("{}, {}: {problem}", board.board, words(fields, row));
     let is_sealed = chosen(fields, row).any(|(field, _)| field.path == SEALED.path);
     let features = if is_sealed && board.home.is_some() { SEALED.path } else { "" };
-    let used = build::bootloader_size(board, features, product).map_err(told)?;
+    let used = build::bootloader_size(board, features, product).map_err(named)?;
     for (bytes, budget) in used.iter().zip(budgets(board)) {
-        within(*bytes, budget).map_err(told)?;
+        within(*bytes, budget).map_err(named)?;
     }
     if board.home.is_none() {
-        spare(used.iter().sum()).map_err(told)?;
+        spare(used.iter().sum()).map_err(named)?;
     }
     Ok(used.iter().sum())
 }

@@ -56,13 +56,13 @@ pub fn metadata() -> Outcome<Value> {
 
 /// The crates that `cargo tree` lists, as `NAME VERSION`.
 pub fn tree(words: &[&str]) -> Outcome<BTreeSet<String>> {
-    let said = output(cargo("tree --locked --prefix none --no-dedupe --format {p}").args(words))?;
+    let tree = output(cargo("tree --locked --prefix none --no-dedupe --format {p}").args(words))?;
     // `name v1.2.3`, and more.
     let krate = |line: &str| {
         let mut words = line.split(' ');
         Some(format!("{} {}", words.next()?, words.next()?.strip_prefix('v')?))
     };
-    Ok(said.lines().filter_map(krate).collect())
+    Ok(tree.lines().filter_map(krate).collect())
 }
 
 /// git in the repository; returns what it prints.
@@ -119,9 +119,9 @@ fn ended(command: &mut Command) -> Outcome<Output> {
     if output.status.success() {
         return Ok(output);
     }
-    let said = if output.stderr.is_empty() { &output.stdout } else { &output.stderr };
-    let said = String::from_utf8_lossy(said);
-    Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()))
+    let text = if output.stderr.is_empty() { &output.stdout } else { &output.stderr };
+    let text = String::from_utf8_lossy(text);
+    Err(format!("`{}` failed ({}): {}", line(command), output.status, text.trim()))
 }
 
 /// Whether a program can be started and succeeds; its output is not shown.

@@ -104,8 +104,8 @@ mod tests {
             ("", "there is no product"),
             ("nowhere/lift.rs", "nowhere/lift.rs: "),
         ] {
-            let said = Product::chosen(word).unwrap_err();
-            assert!(said.contains(why), "{said}");
+            let refusal = Product::chosen(word).unwrap_err();
+            assert!(refusal.contains(why), "{refusal}");
         }
         // It would have the name of the customer's, or one that a file of an image cannot have.
         let root = workspace::root();

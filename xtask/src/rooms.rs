@@ -60,7 +60,7 @@ const COFLASH: &[Rule] = &[
 /// The dependencies of `coflash-core` that a room may use only if its row lists them.
 const OURS: [&str; 3] = ["canopen", "coboot_can", "shared_abi"];
 
-/// For each module or file, those that it uses.
+/// For each room, those that it uses.
 type Graph = BTreeMap<String, BTreeSet<String>>;
 
 /// The graph of the rooms, from the graph of all files. Uses by the root are left out.
@@ -86,27 +86,27 @@ fn crates(sources: &[(String, String)]) -> Graph {
     graph
 }
 
-/// A circle in the graph, if there is one: each room uses the next one, and the last one the first.
-fn circle(graph: &Graph) -> Option<Vec<String>> {
-    fn walk(
-        graph: &Graph,
-        at: &str,
-        path: &mut Vec<String>,
-        done: &mut BTreeSet<String>,
-    ) -> Option<Vec<String>> {
-        if let Some(from) = path.iter().position(|room| room == at) {
+/// A circle in the graph, if there is one: each node uses the next one, and the last one the first.
+fn circle<T: Clone + Ord>(graph: &BTreeMap<T, BTreeSet<T>>) -> Option<Vec<T>> {
+    fn walk<T: Clone + Ord>(
+        graph: &BTreeMap<T, BTreeSet<T>>,
+        at: &T,
+        path: &mut Vec<T>,
+        done: &mut BTreeSet<T>,
+    ) -> Option<Vec<T>> {
+        if let Some(from) = path.iter().position(|node| node == at) {
             return Some(path[from..].to_vec());
         }
-        if !done.insert(at.to_owned()) {
+        if !done.insert(at.clone()) {
             return None;
         }
-        path.push(at.to_owned());
+        path.push(at.clone());
         let found = graph.get(at)?.iter().find_map(|used| walk(graph, used, path, done));
         path.pop();
         found
     }
     let mut done = BTreeSet::new();
-    graph.keys().find_map(|room| walk(graph, room, &mut Vec::new(), &mut done))
+    graph.keys().find_map(|node| walk(graph, node, &mut Vec::new(), &mut done))
 }
 
 /// The faults in the modules of a crate, as messages. `sources` are the path of each file below
@@ -117,8 +117,10 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     let mut broken = Vec::new();
     if let Some(circle) = circle(&rooms) {
         broken.push(format!("{name}: these modules use each other in a circle: {}", circle.join(" -> ")));
-    } else if let Some(circle) = circle(&by_name(&files)) {
-        broken.push(format!("{name}: these files use each other in a circle: {}", circle.join(" -> ")));
+    } else if let Some(circle) = circle(&files) {
+        let names = circle.iter().map(|file| if file.is_empty() { "(root)".into() } else { file.join("::") });
+        let names: Vec<String> = names.collect();
+        broken.push(format!("{name}: these files use each other in a circle: {}", names.join(" -> ")));
     }
     let rules = match name {
         "boot-core" => BOOT_CORE,
@@ -141,15 +143,6 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
         }
     }
     broken
-}
-
-/// The graph of the files in the form for [`circle`].
-fn by_name(files: &modules::Graph) -> Graph {
-    let name = |module: &modules::Module| match module.as_slice() {
-        [] => "(root)".to_owned(),
-        parts => parts.join("::"),
-    };
-    files.iter().map(|(file, uses)| (name(file), uses.iter().map(name).collect())).collect()
 }
 
 #[cfg(test)]

@@ -18,8 +18,8 @@ fn release() -> &'static str {
 /// The line of `rustc --version` of the compiler that cargo uses here.
 pub fn line() -> String {
     let mut rustc = Command::new(env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-    let said = process::output(rustc.arg("--version").current_dir(workspace::root()).stdin(Stdio::null()));
-    said.map_or_else(|_| "unknown".to_owned(), |said| said.trim().to_owned())
+    let version = process::output(rustc.arg("--version").current_dir(workspace::root()).stdin(Stdio::null()));
+    version.map_or_else(|_| "unknown".to_owned(), |version| version.trim().to_owned())
 }
 
 /// Whether this is the compiler of a release.

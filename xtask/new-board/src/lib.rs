@@ -422,8 +422,8 @@ mod tests {
             (["", "", "", "", "PA13"], "entry_strap is a pin of the debugger"),
             (["", "", "", "PA5", "PA5"], "entry_strap is the pin of the LED"),
         ] {
-            let said = fit(&STM32F446RE, words).err().unwrap_or_else(|| panic!("{words:?}"));
-            assert!(said.contains(says), "{words:?}: {said}");
+            let refusal = fit(&STM32F446RE, words).err().unwrap_or_else(|| panic!("{words:?}"));
+            assert!(refusal.contains(says), "{words:?}: {refusal}");
         }
     }
 

@@ -28,17 +28,17 @@ pub struct Answer {
     /// The last document that was printed.
     pub value: Value,
     /// All that was printed.
-    pub said: String,
+    pub stdout: String,
     errors: String,
 }
 
 impl Answer {
-    fn new(output: &Output, said: String) -> Self {
-        let whole = process::json(&said).ok();
-        let last = || said.lines().rev().find_map(|line| process::json(line).ok());
+    fn new(output: &Output, stdout: String) -> Self {
+        let whole = process::json(&stdout).ok();
+        let last = || stdout.lines().rev().find_map(|line| process::json(line).ok());
         let value = whole.or_else(last).unwrap_or(Value::Null);
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
-        Self { code: output.status.code(), value, said, errors }
+        Self { code: output.status.code(), value, stdout, errors }
     }
 
     /// The answer of a call that had to succeed; otherwise its message is the error.
@@ -62,7 +62,7 @@ impl Answer {
 }
 
 /// A frame in a trace.
-pub struct Heard {
+pub struct TracedFrame {
     /// The adapter's time, in seconds.
     pub seconds: f64,
     /// As candump writes it: `701#00`.
@@ -70,20 +70,20 @@ pub struct Heard {
 }
 
 /// The frames of a candump log.
-fn heard(log: &str) -> Vec<Heard> {
+fn frames(log: &str) -> Vec<TracedFrame> {
     let frame = |line: &str| {
         let mut words = line.split_whitespace();
         let seconds = words.next()?.trim_matches(['(', ')']).parse().ok()?;
-        Some(Heard { seconds, frame: words.nth(1)?.to_owned() })
+        Some(TracedFrame { seconds, frame: words.nth(1)?.to_owned() })
     };
     log.lines().filter_map(frame).collect()
 }
 
 /// The seconds from the last frame that begins like this to the frame `end` that follows.
-pub fn between(heard: &[Heard], start: &str, end: &str) -> Option<f64> {
-    let at = heard.iter().rposition(|one| one.frame == end)?;
-    let from = heard[..at].iter().rfind(|one| one.frame.starts_with(start))?;
-    Some(heard[at].seconds - from.seconds)
+pub fn between(frames: &[TracedFrame], start: &str, end: &str) -> Option<f64> {
+    let at = frames.iter().rposition(|one| one.frame == end)?;
+    let from = frames[..at].iter().rfind(|one| one.frame.starts_with(start))?;
+    Some(frames[at].seconds - from.seconds)
 }
 
 impl Coflash {
@@ -97,16 +97,16 @@ impl Coflash {
         }
         command.stdin(Stdio::null());
         let output = command.output().map_err(|error| process::not_started(&command, &error))?;
-        let said = String::from_utf8_lossy(&output.stdout).into_owned();
-        Ok(Answer::new(&output, said))
+        let stdout = String::from_utf8_lossy(&output.stdout).into_owned();
+        Ok(Answer::new(&output, stdout))
     }
 
     /// The same, with the frames that were on the bus meanwhile; a file in `folder` gets them.
-    pub fn traced(&self, words: &[&str], folder: &Path) -> Outcome<(Answer, Vec<Heard>)> {
+    pub fn traced(&self, words: &[&str], folder: &Path) -> Outcome<(Answer, Vec<TracedFrame>)> {
         files::make(folder)?;
         let file = folder.join("trace.log");
         let answer = self.call(&[words, &["--trace", &file.display().to_string()]].concat())?;
-        Ok((answer, heard(&files::text(&file)?)))
+        Ok((answer, frames(&files::text(&file)?)))
     }
 
     /// Whether `--bus` leaves the adapter's bit rate to the job.
@@ -125,16 +125,16 @@ mod tests {
     #[test]
     fn the_time_between_two_frames_is_that_of_the_log() {
         let log = "(1.000000) can0 581#60511F0100000000 R\n(1.5) can0 701#05\n\n(2.012500) can0 701#00 R\n";
-        assert_eq!(between(&heard(log), "581#60511F01", "701#00"), Some(2.0125 - 1.0));
-        assert_eq!(between(&heard(log), "701#00", "581#60511F01"), None);
-        assert_eq!(between(&heard("x\n(a) b c\n"), "581", "701#00"), None);
+        assert_eq!(between(&frames(log), "581#60511F01", "701#00"), Some(2.0125 - 1.0));
+        assert_eq!(between(&frames(log), "701#00", "581#60511F01"), None);
+        assert_eq!(between(&frames("x\n(a) b c\n"), "581", "701#00"), None);
     }
 
     #[test]
     fn an_error_brings_its_advice() {
-        let told = r#"{"error":{"what":"node 1 does not answer","advice":"check its power"}}"#;
+        let document = r#"{"error":{"what":"node 1 does not answer","advice":"check its power"}}"#;
         let output = Output { status: ExitStatus::from_raw(5 << 8), stdout: Vec::new(), stderr: Vec::new() };
-        let problem = Answer::new(&output, told.into()).good().err().unwrap();
+        let problem = Answer::new(&output, document.into()).good().err().unwrap();
         assert_eq!(problem, "node 1 does not answer. What to do: check its power.");
     }
 }

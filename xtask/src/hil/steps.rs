@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use super::bench::{Bench, Done, Hand};
-use super::coflash::{between, Answer, Heard};
+use super::coflash::{between, Answer, TracedFrame};
 use crate::{files, outcome::Outcome, process};
 
 /// A step: its name in the report, and what carries it out. The error says why it failed and what to do.
@@ -129,7 +129,7 @@ fn update_suite(bench: &mut Bench) -> Outcome<Done> {
 fn run_conform(bench: &mut Bench, words: &[&str]) -> Outcome<Done> {
     // A board answers in milliseconds; the host may have other things to do.
     let answer = bench.coflash.call(&[words, &["--answer-timeout", "2000"]].concat())?;
-    let Some(document) = process::json(&answer.said).ok().filter(|value| value["checks"].is_array()) else {
+    let Some(document) = process::json(&answer.stdout).ok().filter(|value| value["checks"].is_array()) else {
         return Err(answer.problem());
     };
     let failed: Vec<_> =
@@ -170,11 +170,11 @@ fn runs_installed(bench: &Bench) -> Outcome {
 /// 10 ms before the device leaves, and the bootloader comes within milliseconds by each way (docs/bench.md); the watchdog's time after a reset, 349 to 964 ms, would be a mistake.
 fn way_back(bench: &mut Bench, way: &str) -> Outcome<Done> {
     bench.coflash.call(&["write", "2000", way, "--type", "u8"])?.good()?;
-    let (answer, heard) = bench.coflash.traced(&["enter", "--within", "10000"], &bench.work)?;
+    let (answer, frames) = bench.coflash.traced(&["enter", "--within", "10000"], &bench.work)?;
     answer.good()?;
     let node = bench.coflash.node;
-    let (said, up) = (format!("{:X}#60511F01", 0x580 + node), format!("{:X}#00", 0x700 + node));
-    let seconds = between(&heard, &said, &up)
+    let (confirmed, up) = (format!("{:X}#60511F01", 0x580 + node), format!("{:X}#00", 0x700 + node));
+    let seconds = between(&frames, &confirmed, &up)
         .ok_or("the trace has no answer to 1F51h = 80h with a boot-up after it.")?;
     if !(0.008..=0.05 + LATE).contains(&seconds) {
         return Err(format!("{seconds:.3} s from the answer to the boot-up: it must be 0.010 to 0.05 s."));
@@ -263,10 +263,10 @@ fn bus_off(bench: &mut Bench) -> Outcome<Done> {
     }
     sleep(Duration::from_secs(3));
     bench.hand(Hand::Short, false)?;
-    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "6000"], &bench.work)?;
+    let (_, frames) = bench.coflash.traced(&["monitor", "--for", "6000"], &bench.work)?;
     let node = bench.coflash.node;
-    let told = format!("{:03X}#4081", 0x80 + node);
-    if !heard.iter().any(|heard| heard.frame.starts_with(&told)) {
+    let emergency = format!("{:03X}#4081", 0x80 + node);
+    if !frames.iter().any(|one| one.frame.starts_with(&emergency)) {
         return Err("no emergency 8140h within 6 s after the short. On SocketCAN the adapter may be off the bus itself: \
                     `ip link set can0 type can restart-ms 100`."
             .into());
@@ -278,8 +278,8 @@ fn bus_off(bench: &mut Bench) -> Outcome<Done> {
 /// After a restart: nothing if the device is silent for five seconds, otherwise what it says of itself.
 fn silent_or_info(bench: &mut Bench) -> Outcome<Value> {
     bench.restart()?;
-    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "5000"], &bench.work)?;
-    if heard.is_empty() {
+    let (_, frames) = bench.coflash.traced(&["monitor", "--for", "5000"], &bench.work)?;
+    if frames.is_empty() {
         return Ok(Value::Null);
     }
     info_after_start(bench)
@@ -293,9 +293,9 @@ fn crystal(bench: &mut Bench) -> Outcome<Done> {
         return not_run("nobody stops the crystal: --crystal-command, or a terminal to ask at");
     }
     // The crystal runs again whatever comes.
-    let seen = silent_or_info(bench);
+    let result = silent_or_info(bench);
     bench.hand(Hand::Crystal, false)?;
-    let info = seen?;
+    let info = result?;
     bench.restart()?;
     info_after_start(bench)?;
     match info["state"]["clock"].as_u64() {
@@ -319,11 +319,12 @@ fn hung_program(bench: &mut Bench) -> Outcome<Done> {
     install_code(bench, &[0xB672, 0xE7FE])?;
     bench.coflash.call(&["release"])?.good()?;
     bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
-    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "9000"], &bench.work)?;
+    let (_, frames) = bench.coflash.traced(&["monitor", "--for", "9000"], &bench.work)?;
     let node = bench.coflash.node;
-    let ups: Vec<&Heard> = heard.iter().filter(|one| one.frame == format!("{:X}#00", 0x700 + node)).collect();
+    let ups: Vec<&TracedFrame> =
+        frames.iter().filter(|one| one.frame == format!("{:X}#00", 0x700 + node)).collect();
     let given_up = format!("{:03X}#00600102", 0x80 + node);
-    if ups.len() != 3 || !heard.iter().any(|one| one.frame.starts_with(&given_up)) {
+    if ups.len() != 3 || !frames.iter().any(|one| one.frame.starts_with(&given_up)) {
         return Err(format!(
             "{} boot-ups in 9 s, and not three with an emergency 6000h/02h: the watchdog is late, or does not bite.",
             ups.len()

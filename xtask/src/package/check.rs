@@ -97,14 +97,14 @@ pub fn wheel(release: &Release, root: &Path) -> Outcome {
     let pip =
         ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--find-links"];
     process::run(Command::new(&python).args(pip).arg(&release.dist).arg("coflash"))?;
-    let said = process::output(Command::new(root.join("venv/bin/coflash")).arg("--version"))?;
-    said_in(&said, VERSION, "coflash --version")?;
+    let output = process::output(Command::new(root.join("venv/bin/coflash")).arg("--version"))?;
+    must_contain(&output, VERSION, "coflash --version")?;
     process::run(&mut process::cargo("build --quiet --package coboot-node"))?;
     let node = workspace::target_dir().join("debug/coboot-node");
     files::write(&root.join("program.bin"), sample())?;
     let mut flash = Command::new(&python);
     flash.args(["-I", "-c", UPDATE]).arg(node).current_dir(root);
-    said_in(&process::output(&mut flash)?, &sample().len().to_string(), "coflash.flash")
+    must_contain(&process::output(&mut flash)?, &sample().len().to_string(), "coflash.flash")
 }
 
 /// Starts a node on a bus of its own, and updates it.
@@ -132,8 +132,8 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
     install.arg("--target-dir").arg(workspace::target_dir());
     process::run(&mut install)?;
     let installed = root.join("bin/coflash");
-    let said = process::output(Command::new(&installed).arg("--version").current_dir(root))?;
-    said_in(&said, VERSION, "coflash --version")
+    let output = process::output(Command::new(&installed).arg("--version").current_dir(root))?;
+    must_contain(&output, VERSION, "coflash --version")
 }
 
 /// Compiles what the files for the registry have, and runs its tests, in a folder without the repository. None of
@@ -181,10 +181,10 @@ fn works(root: &Path, program: &str) -> Outcome {
             command.args(words).current_dir(root).env_clear().env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin"),
         )
     };
-    said_in(&run(&["--version"])?, VERSION, "coflash --version")?;
+    must_contain(&run(&["--version"])?, VERSION, "coflash --version")?;
     files::write(&root.join("app.bin"), sample())?;
     run(&["convert", "app.bin", "app.blk", "-I", "binary", "--board", "stm32f407g-disc1"])?;
-    said_in(&run(&["inspect", "app.blk"])?, "can be a program", "coflash inspect")?;
+    must_contain(&run(&["inspect", "app.blk"])?, "can be a program", "coflash inspect")?;
     // They do not belong to the package.
     ["app.bin", "app.blk"].into_iter().try_for_each(|file| {
         fs::remove_file(root.join(file)).map_err(|error| format!("{file} cannot be removed: {error}."))
@@ -212,12 +212,12 @@ pub fn windows(release: &Release, _: &Path) -> Outcome {
 
 /// Checks a program for Windows, of which objdump says this: it is one of x86-64, and uses the libraries
 /// of Windows alone. Those of the compiler begin with `lib`.
-fn runs_on_windows(said: &str) -> Outcome {
-    if !said.contains("file format pei-x86-64") {
+fn runs_on_windows(output: &str) -> Outcome {
+    if !output.contains("file format pei-x86-64") {
         return Err("the program for Windows is none of x86-64.".into());
     }
     let libraries: Vec<String> =
-        said.lines().filter_map(|line| Some(line.split_once("DLL Name: ")?.1.to_lowercase())).collect();
+        output.lines().filter_map(|line| Some(line.split_once("DLL Name: ")?.1.to_lowercase())).collect();
     if !libraries.iter().any(|name| name == "kernel32.dll") {
         return Err(format!("the program for Windows does not import KERNEL32.dll; it has: {libraries:?}."));
     }
@@ -227,11 +227,11 @@ fn runs_on_windows(said: &str) -> Outcome {
     }
 }
 
-fn said_in(said: &str, expected: &str, who: &str) -> Outcome {
-    if said.contains(expected) {
+fn must_contain(output: &str, expected: &str, who: &str) -> Outcome {
+    if output.contains(expected) {
         return Ok(());
     }
-    Err(format!("{who} says nothing of \"{expected}\":\n{said}"))
+    Err(format!("{who} says nothing of \"{expected}\":\n{output}"))
 }
 
 #[cfg(test)]

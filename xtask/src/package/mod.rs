@@ -59,7 +59,7 @@ const PARTS: [Part; 7] = [
 pub fn run(mut args: Args) -> Outcome {
     let checked = args.flag("--check");
     let draft = args.flag("--draft");
-    let parts = parts(&args.rest())?;
+    let parts = parts(&args.remaining())?;
     if !draft {
         toolchain::check(&toolchain::line())
             .map_err(|other| format!("{other} Or add --draft for a trial."))?;

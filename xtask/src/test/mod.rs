@@ -54,72 +54,100 @@ const NOT_RUN: &str = "not run, for they take hours: cargo xtask mutants, fuzz, 
 /// The least free space for a run from an empty folder, in KiB.
 const ROOM: u64 = 5 << 20;
 
-pub fn run(mut args: Args) -> Outcome {
-    let chosen_board = workspace::chosen_board(&mut args)?;
-    let all = args.flag("--all");
-    let part = args.value("--part")?;
-    let words = args.rest();
-    if all && (chosen_board.is_some() || !words.is_empty()) {
-        return Err("--all goes with --part alone.".into());
-    }
-    if part.is_some() && !all {
-        return Err("--part goes with --all.".into());
-    }
-    let chosen = part.as_deref().or((!all).then_some("product"));
-    let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| is_part(chosen, name));
-    let stages: Vec<Stage> = STAGES.into_iter().filter(is_chosen).collect();
-    if stages.is_empty() {
-        let names = STAGES.map(|(name, ..)| name);
-        return Err(format!("--part takes one of {}; or K/N, such as 2/4.", names.join(", ")));
-    }
-    if all {
-        for stage @ (name, about, minutes, ..) in STAGES {
-            let word = if is_chosen(&stage) { "runs" } else { "in another part" };
-            println!("{name:<8} {minutes:>3} min  {about:<54} {word}");
+/// What the command line chooses.
+struct Chosen {
+    board: Option<&'static Layout>,
+    all: bool,
+    part: Option<String>,
+    stages: Vec<Stage>,
+    /// The words for cargo test.
+    words: Vec<String>,
+}
+
+impl Chosen {
+    fn new(mut args: Args) -> Outcome<Self> {
+        let board = workspace::chosen_board(&mut args)?;
+        let (all, part) = (args.flag("--all"), args.value("--part")?);
+        let words = args.remaining();
+        if all && (board.is_some() || !words.is_empty()) {
+            return Err("--all goes with --part alone.".into());
         }
-        println!("{NOT_RUN}\n");
+        if part.is_some() && !all {
+            return Err("--part goes with --all.".into());
+        }
+        let chosen = part.as_deref().or((!all).then_some("product"));
+        let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| is_part(chosen, name));
+        let stages: Vec<Stage> = STAGES.into_iter().filter(is_chosen).collect();
+        if stages.is_empty() {
+            let names = STAGES.map(|(name, ..)| name);
+            return Err(format!("--part takes one of {}; or K/N, such as 2/4.", names.join(", ")));
+        }
+        if all {
+            for stage @ (name, about, minutes, ..) in STAGES {
+                let word = if is_chosen(&stage) { "runs" } else { "in another part" };
+                println!("{name:<8} {minutes:>3} min  {about:<54} {word}");
+            }
+            println!("{NOT_RUN}\n");
+        }
+        Ok(Self { board, all, part, stages, words })
     }
 
-    // Before anything takes time: what is missing on this machine.
-    let tier = stages.iter().map(|(_, _, _, tier, _)| *tier).max().unwrap_or(Tier::Product);
-    room()?;
-    setup::prepare(tier.needs())?;
-    // No other run uses the build results of this clone.
-    let _alone = files::lock("tests", "Another `cargo xtask test` runs in this clone.")?;
-    if !words.is_empty() {
-        // With a board: its images, and the programs that are compiled for it.
-        match chosen_board {
+    /// The name of the record: each part of a run has one of its own, and the page adds them up.
+    fn record(&self) -> String {
+        match (&self.part, self.board) {
+            (Some(part), _) => format!("tests-all-{}", part.replace('/', "-of-")),
+            (None, Some(board)) => format!("tests-{}", board.board),
+            _ if self.all => "tests-all".into(),
+            _ => "tests".to_owned(),
+        }
+    }
+
+    /// Runs `cargo test` with the words. With a board: its images, and the programs that are compiled for it.
+    fn cargo_test(&self) -> Outcome {
+        match self.board {
             Some(board) => build::boards(&[(board, "")])?,
             None => build_images(Tier::Product)?,
         }
         programs_of_ours()?;
         let mut cargo = process::cargo("test");
-        cargo.current_dir(workspace::root()).args(chosen_board.map(|_| "--package=coboot-tests"));
-        cargo.args(words).envs(variables(chosen_board.unwrap_or(DEFAULT)));
-        return process::run(&mut cargo);
+        cargo.current_dir(workspace::root()).args(self.board.map(|_| "--package=coboot-tests"));
+        cargo.args(&self.words).envs(variables(self.board.unwrap_or(DEFAULT)));
+        process::run(&mut cargo)
     }
 
-    let started = Instant::now();
-    // Each part of a run has a record of its own; the page adds them up.
-    let name = match (&part, chosen_board) {
-        (Some(part), _) => format!("tests-all-{}", part.replace('/', "-of-")),
-        (None, Some(board)) => format!("tests-{}", board.board),
-        _ if all => "tests-all".into(),
-        _ => "tests".to_owned(),
-    };
-    evidence::begin(&name)?;
-    let mut summary = Summary::default();
-    if let Some(board) = chosen_board {
-        on_board(board, Tier::Night, &mut summary)?;
-    } else {
-        for (name, about, _, _, run) in stages {
+    /// Runs the stages, or every test with the firmware of the board.
+    fn stages(&self) -> Outcome<Summary> {
+        let mut summary = Summary::default();
+        if let Some(board) = self.board {
+            on_board(board, Tier::Night, &mut summary)?;
+            return Ok(summary);
+        }
+        for (name, about, _, _, run) in &self.stages {
             println!("== {name}: {about}");
             if let Err(problem) = run(&mut summary) {
                 println!("{problem}");
                 summary.failed.push(format!("{name}: something did not build or broke off"));
             }
         }
+        Ok(summary)
     }
+}
+
+pub fn run(args: Args) -> Outcome {
+    let chosen = Chosen::new(args)?;
+    // Before anything takes time: what is missing on this machine.
+    let tier = chosen.stages.iter().map(|(_, _, _, tier, _)| *tier).max().unwrap_or(Tier::Product);
+    room()?;
+    setup::prepare(tier.needs())?;
+    // No other run uses the build results of this clone.
+    let _alone = files::lock("tests", "Another `cargo xtask test` runs in this clone.")?;
+    if !chosen.words.is_empty() {
+        return chosen.cargo_test();
+    }
+    let started = Instant::now();
+    let name = chosen.record();
+    evidence::begin(&name)?;
+    let summary = chosen.stages()?;
     // What Ctrl-C has ended has not failed.
     while process::IS_ENDING.load(Ordering::Relaxed) {
         std::thread::park();
@@ -129,7 +157,7 @@ pub fn run(mut args: Args) -> Outcome {
     for name in &summary.failed {
         println!("FAILED: {name}");
     }
-    if all {
+    if chosen.all {
         println!("{NOT_RUN}");
     }
     println!("{} min", started.elapsed().as_secs().div_ceil(60));
@@ -160,8 +188,9 @@ fn room() -> Outcome {
     let folder = workspace::target_dir();
     files::make(&folder)?;
     // POSIX: the fourth column of the second line is the free space in units of 1024 bytes.
-    let said = process::output(std::process::Command::new("df").arg("-kP").arg(&folder)).unwrap_or_default();
-    let free = said.lines().nth(1).and_then(|line| line.split_whitespace().nth(3)?.parse::<u64>().ok());
+    let output =
+        process::output(std::process::Command::new("df").arg("-kP").arg(&folder)).unwrap_or_default();
+    let free = output.lines().nth(1).and_then(|line| line.split_whitespace().nth(3)?.parse::<u64>().ok());
     let needed = if folder.join("firmware").exists() { ROOM / 8 } else { ROOM };
     match free {
         Some(free) if free < needed => Err(format!(
