@@ -192,13 +192,19 @@ pub fn named(name: &str) -> &'static Golden {
     golden().iter().find(|record| record.name == name).unwrap_or_else(|| panic!("no {name}"))
 }
 
-/// Each record as it is written today, from the golden values, and what its reader sees then.
-fn written() -> Vec<(String, Vec<u8>, String)> {
-    let some = |value: &dyn std::fmt::Debug| format!("Some({value:?})");
-    let mut all = Vec::new();
-    let mut add = |name: &str, bytes, seen: String| all.push((name.to_owned(), bytes, seen));
+/// A record as it is written today, from the golden values, and what its reader sees then.
+type Written = (String, Vec<u8>, String);
 
-    for (name, request) in [
+fn written(name: &str, bytes: Vec<u8>, seen: impl Into<String>) -> Written {
+    (name.to_owned(), bytes, seen.into())
+}
+
+fn some(value: impl std::fmt::Debug) -> String {
+    format!("Some({value:?})")
+}
+
+fn warm_starts() -> Vec<Written> {
+    let requests = [
         ("answer owed", BootRequest::Owed(Owed { program: 2, value: 3, node_id: 127 })),
         ("stay", BootRequest::Stay),
         ("trial", BootRequest::Trial(254)),
@@ -214,11 +220,15 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         ("renewal", BootRequest::Renewal(TrialStep::GivenUp)),
         ("ROM loader", BootRequest::RomLoader),
         ("rescue", BootRequest::Rescue),
-    ] {
-        add(&format!("warm-start cell: {name}"), bytes(&WarmStart::new(request)), some(&request));
-    }
-    add("warm-start cell: mark", bytes(&WarmStart::MARKED), "true".to_owned());
+    ];
+    let cells = requests.map(|(name, request)| {
+        written(&format!("warm-start cell: {name}"), bytes(&WarmStart::new(request)), some(request))
+    });
+    cells.into_iter().chain([written("warm-start cell: mark", bytes(&WarmStart::MARKED), "true")]).collect()
+}
 
+/// What the boot stage leaves for a program and for the bootloader.
+fn of_boot_stage() -> Vec<Written> {
     let info = BootInfo {
         node_id: 5,
         bit_rate: 125_000,
@@ -233,10 +243,8 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         program_date: 1_795_804_215,
         nameplate: true,
     };
-    add("handoff", bytes(&Handoff::new(&info)), some(&info));
-    let info = BootInfo { trial: false, fresh: false, nameplate: false, bootloader_number: None, ..info };
-    let info = BootInfo { sdo: SdoBases::PREDEFINED, program_date: 0, bit_rate: 0, ..info };
-    add("handoff: least", bytes(&Handoff::new(&info)), some(&info));
+    let least = BootInfo { trial: false, fresh: false, nameplate: false, bootloader_number: None, ..info };
+    let least = BootInfo { sdo: SdoBases::PREDEFINED, program_date: 0, bit_rate: 0, ..least };
     let report = BootReport {
         reason: 14,
         held_program: 2,
@@ -252,11 +260,17 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
     };
     let end = (Origin::Confirmed, TrialEnd::Reset(ResetCause::IndependentWatchdog));
     let words = BootReport { renewal: renewal::word(end.0, end.1), ..report }.words();
-    add("boot report", bytes(&words), some(&(report, Some(Reason::Compaction), end)));
+    vec![
+        written("handoff", bytes(&Handoff::new(&info)), some(info)),
+        written("handoff: least", bytes(&Handoff::new(&least)), some(least)),
+        written("boot report", bytes(&words), some((report, Some(Reason::Compaction), end))),
+    ]
+}
+
+/// What a program and the callgate have, and what production writes.
+fn of_programs() -> Vec<Written> {
     let plate = Nameplate::new(0x123, 0x5EA1_0007, 0x0002_0003, 123_456).words();
-    add("nameplate", bytes(&plate), some(&[0x123, 0x5EA1_0007, 0x0002_0003, 123_456]));
     let label = Label::dated(0x319, 0x4007_D151, 0x0001_0203, 1_795_804_215).emit();
-    add("label", label.to_vec(), some(&[0x319, 0x4007_D151, 0x0001_0203, 1_795_804_215]));
     let table = Table {
         magic: callgate::MAGIC,
         abi_version: callgate::ABI_VERSION,
@@ -264,13 +278,22 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         bootloader_version: 0x0001_0002,
         entry: 0x0800_0211,
     };
-    add("callgate", bytes(&table), "Ok(65538)".to_owned());
     let crc = Crc32Args { address: 0x0802_0000, len: 9, crc: 0xCBF4_3926 };
-    add("arguments: CRC", bytes(&crc), format!("{crc:?}"));
     let node = NodeArgs { node_id: 42, bit_rate: 250_000 };
-    add("arguments: node", bytes(&node), format!("{node:?}"));
     let program = ProgramArgs { number: 2, size: 4096, crc: 5, version: 6, flags: 3 };
-    add("arguments: program", bytes(&program), format!("{program:?}"));
+    vec![
+        written("nameplate", bytes(&plate), some([0x123, 0x5EA1_0007, 0x0002_0003, 123_456])),
+        written("label", label.to_vec(), some([0x319, 0x4007_D151, 0x0001_0203, 1_795_804_215])),
+        written("callgate", bytes(&table), "Ok(65538)"),
+        written("arguments: CRC", bytes(&crc), format!("{crc:?}")),
+        written("arguments: node", bytes(&node), format!("{node:?}")),
+        written("arguments: program", bytes(&program), format!("{program:?}")),
+        written("key block", key_block(), "([Some(16), Some(52)], [Some(88), Some(124)])"),
+    ]
+}
+
+/// The header of a RAM image, and what it checks in the resident part.
+fn of_renewal() -> Vec<Written> {
     let header = Header {
         magic: ram_image::MAGIC,
         crc: 0xA1A2_A3A4,
@@ -289,8 +312,6 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         facts: 0x0FAC_7500,
         reserved: 0,
     };
-    add("RAM image header", bytes(&header), "Ok(())".to_owned());
-
     let facts = Facts {
         board: 0x1234_5678,
         size: Facts::SIZE,
@@ -322,8 +343,16 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         services[at..at + 4].copy_from_slice(&word.to_le_bytes());
     }
     services.extend(bytes(&facts));
-    add("services and facts", services, some(&(2, facts)));
+    vec![
+        written("RAM image header", bytes(&header), "Ok(())"),
+        written("services and facts", services, some((2, facts))),
+    ]
+}
 
+fn of_journals() -> Vec<Written> {
+    let mut all = Vec::new();
+    let mut add =
+        |name: &str, bytes, seen: String| all.push(written(&format!("journal: {name}"), bytes, seen));
     let plain = ProgramRecord {
         size: 0x1_2340,
         crc: 0xCAFE_F00D,
@@ -350,32 +379,36 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
         ),
     ] {
         let [_, made] = journal(Key::program(number), record.value());
-        add(&format!("journal: program, {name}"), made, format!("{:?}", (Some(record), [0_u32; 2])));
+        add(&format!("program, {name}"), made, format!("{:?}", (Some(record), [0_u32; 2])));
     }
     let partial = [0x1122_3344, 0x0802_8000];
     let [id, end] = partial;
     let value = ProgramRecord::none(true, ProgramRecord::partial_of([0, id, end, 0]));
     let [_, made] = journal(Key::program(1), value);
     let none = None::<ProgramRecord>;
-    add("journal: no program, a download goes on", made, format!("{:?}", (none, partial)));
+    add("no program, a download goes on", made, format!("{:?}", (none, partial)));
     for (name, state) in
         [("staged", State::Staged), ("confirmed", State::Confirmed), ("installed", State::Installed)]
     {
         let record = RenewalRecord { state, size: 0x9000, crc: 0xCAFE_F00D, home: 0x0BAD_CAFE };
         let [_, made] = journal(Key::program(renewal::BOOTLOADER), record.value());
-        add(&format!("journal: RAM image, {name}"), made, some(&record));
+        add(&format!("RAM image, {name}"), made, some(record));
     }
     for (name, id, bit_rate) in
         [("node-ID and bit rate", NodeId::new(127), BitRate::K125), ("no node-ID", None, BitRate::Auto)]
     {
         let node = NodeParameters { id, bit_rate };
         let [header, made] = journal(Key::NODE, node.value());
-        add(&format!("journal: {name}"), made, format!("{node:?}"));
+        add(name, made, format!("{node:?}"));
         if id.is_some() {
-            add("journal: header", header, format!("{node:?}"));
+            add("header", header, format!("{node:?}"));
         }
     }
 
+    all
+}
+
+fn key_block() -> Vec<u8> {
     let mut block = vec![0; seal::key_block::SIZE];
     for (at, data) in [
         (0, &seal::key_block::MAGIC[..]),
@@ -395,13 +428,12 @@ fn written() -> Vec<(String, Vec<u8>, String)> {
     }
     let check = boot_core::crc32(&block[..seal::key_block::CHECK]);
     block[seal::key_block::CHECK..].copy_from_slice(&check.to_le_bytes());
-    add("key block", block, "([Some(16), Some(52)], [Some(88), Some(124)])".to_owned());
-    all
+    block
 }
 
 #[test]
 fn every_record_is_the_golden_one() {
-    let written = written();
+    let written = [warm_starts(), of_boot_stage(), of_programs(), of_renewal(), of_journals()].concat();
     for Golden { name, bytes, .. } in golden() {
         let (_, made, seen) =
             written.iter().find(|(made, ..)| made == name).unwrap_or_else(|| panic!("nothing writes {name}"));

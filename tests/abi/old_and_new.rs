@@ -6,7 +6,7 @@ use shared_abi::check_word;
 use crate::layout::{golden, named, read, word};
 
 /// What a reader makes of a record.
-enum Seen {
+enum Expected {
     /// The same as of the golden one.
     Same,
     /// That, with these words replaced.
@@ -14,10 +14,10 @@ enum Seen {
     /// This.
     Is(&'static str),
 }
-use Seen::{But, Is, Same};
+use Expected::{But, Is, Same};
 
 /// A golden record, what is else in it, the words that are changed, and what its reader makes of it.
-type Row = (&'static str, &'static str, &'static [(usize, u32)], Seen);
+type Row = (&'static str, &'static str, &'static [(usize, u32)], Expected);
 
 const CELL: &str = "warm-start cell: answer owed";
 const HEADER: &str = "RAM image header";

@@ -128,7 +128,7 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
         writeln!(script, "n 0 {now}").unwrap();
         for _ in 0..200 {
             let request = random.chance(8).then(|| random.pick(&REQUESTS));
-            let told = if let Some(request) = request {
+            let outcome = if let Some(request) = request {
                 writeln!(script, "b {request} {now}").unwrap();
                 let possible = model.begin(request, now);
                 if possible { "taken" } else { "refused" }.to_owned()
@@ -141,8 +141,8 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
                     Next::Leave(request) => format!("leave {request}"),
                 }
             };
-            let leaves: Option<u32> = told.strip_prefix("leave ").and_then(|request| request.parse().ok());
-            expected.push(told);
+            let leaves: Option<u32> = outcome.strip_prefix("leave ").and_then(|request| request.parse().ok());
+            expected.push(outcome);
             if let Some(request) = leaves {
                 left[REQUESTS.iter().position(|known| *known == request).expect("one of them")] += 1;
                 break;
@@ -165,11 +165,11 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let output = Command::new(&program).arg(&events).output().expect("it was just built");
     assert!(output.status.success());
-    let told = String::from_utf8(output.stdout).unwrap();
-    let mut told: Vec<_> = told.lines().collect();
+    let printed = String::from_utf8(output.stdout).unwrap();
+    let mut in_c: Vec<_> = printed.lines().collect();
     // As `coboot_app::ProgramControl`: owed by program 1, for no node.
-    assert_eq!(told.pop(), Some("answers 7 1"));
-    assert_eq!(told.len(), expected.len());
-    let differs = told.iter().zip(&expected).position(|(c, rust)| c != rust);
-    assert_eq!(differs, None, "event {differs:?}: C {:?}", differs.map(|at| (told[at], &expected[at])));
+    assert_eq!(in_c.pop(), Some("answers 7 1"));
+    assert_eq!(in_c.len(), expected.len());
+    let differs = in_c.iter().zip(&expected).position(|(c, rust)| c != rust);
+    assert_eq!(differs, None, "event {differs:?}: C {:?}", differs.map(|at| (in_c[at], &expected[at])));
 }

@@ -7,9 +7,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::{dead_crystal, firmware};
+use coboot_tests::firmware;
 use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::label::label_of;
 use coflash_core::file::read::{read, Firmware};
@@ -83,18 +82,8 @@ fn blocks(elf: &[u8]) -> Program {
         .program
 }
 
-fn board() -> Bench {
-    Bench::new().switched_on()
-}
-
-fn number(bench: &mut Bench, index: u16, sub: u8) -> u32 {
-    bench.session().read_number(Address::new(index, sub)).unwrap()
-}
-
 fn power_cycle(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     bench.run_ms(500);
 }
 
@@ -114,18 +103,17 @@ fn its_memory_map_is_the_boards() {
 fn it_is_updated_twice_and_answers_what_a_host_asks() {
     let Some(elf) = built() else { return };
     let blocks = blocks(&elf);
-    let mut bench = board();
+    let mut bench = Bench::new().switched_on();
     for _ in 0..2 {
         flash(&mut bench.session(), &blocks, &FlashOptions::default().force(true), &mut |_| {}).unwrap();
         assert!(!bench.is_bootloader(NODE));
-        assert_eq!(number(&mut bench, 0x1F51, 1), 1);
-        assert_eq!(number(&mut bench, 0x1F56, 1), blocks.crc());
-        assert_eq!(number(&mut bench, 0x1F57, 1), 0);
-        assert_eq!(number(&mut bench, 0x1018, 2), bsp::IDENTITY.product_code);
+        assert_eq!(bench.number(0x1F51, 1), 1);
+        assert_eq!(bench.number(0x1F56, 1), blocks.crc());
+        assert_eq!(bench.number(0x1F57, 1), 0);
+        assert_eq!(bench.number(0x1018, 2), bsp::IDENTITY.product_code);
         // The label's version is 1.
-        assert_eq!(number(&mut bench, 0x2005, 1), 1);
-        let mut text = |index| bench.session().read_text(Address::new(index, 0)).unwrap();
-        assert_eq!([text(0x1008), text(0x100A)], [bsp::IDENTITY.device_name, "V1.0r0"]);
+        assert_eq!(bench.number(0x2005, 1), 1);
+        assert_eq!([0x1008, 0x100A].map(|index| bench.text(index)), [bsp::IDENTITY.device_name, "V1.0r0"]);
     }
     // Step 5: resets by the NMT master are no crashes: five of them exceed the limit of three.
     for _ in 0..5 {
@@ -144,7 +132,7 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
 #[test]
 fn a_trial_confirms_itself_when_its_master_has_started_it() {
     let Some(elf) = built() else { return };
-    let mut bench = board();
+    let mut bench = Bench::new().switched_on();
     flash(&mut bench.session(), blocks(&elf), &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     for confirms in [false, true] {
         bench.session().command(1, ProgramControl::Start).unwrap();
@@ -157,12 +145,6 @@ fn a_trial_confirms_itself_when_its_master_has_started_it() {
         power_cycle(&mut bench);
         assert_eq!(bench.is_bootloader(NODE), !confirms, "confirmed: {confirms}");
     }
-}
-
-#[test]
-fn it_leaves_for_the_bootloader_when_its_crystal_fails() {
-    let Some(elf) = built() else { return };
-    dead_crystal::brings_the_bootloader(&blocks(&elf));
 }
 
 const LABEL: &str = "coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);";
@@ -184,7 +166,7 @@ fn a_program_without_a_label_is_taken_by_every_device() {
     assert_eq!((label.vendor_id, label.product_code, label.version), (0, bsp::IDENTITY.product_code, 1));
     let Some(without) = altered("without-label", LABEL, "") else { return };
     assert_eq!(labelled(&without), None);
-    let mut bench = board();
+    let mut bench = Bench::new().switched_on();
     flash(&mut bench.session(), blocks(&without), &FlashOptions::default(), &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
 }
@@ -194,7 +176,7 @@ fn a_program_without_a_label_is_taken_by_every_device() {
 #[test]
 fn a_program_with_vtor_at_the_bootloader_is_told_to_be_silent_and_is_replaced() {
     let (Some(good), Some(wrong)) = (built(), altered("wrong-vtor", FIRST, WRONG_VTOR)) else { return };
-    let mut bench = board();
+    let mut bench = Bench::new().switched_on();
     let error =
         flash(&mut bench.session(), blocks(&wrong), &FlashOptions::default(), &mut |_| {}).unwrap_err();
     assert!(error.to_string().contains("the program is not released for autostart"), "{error}");

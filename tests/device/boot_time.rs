@@ -78,8 +78,7 @@ fn fills(costs: bool, limit: fn(u64) -> u64) {
 fn starts(bench: &mut Bench, set: impl Fn(&mut Bench)) -> [Span; 4] {
     let start = |bench: &mut Bench| {
         bench.run_ms(20);
-        bench.session().command(1, ProgramControl::Start).unwrap();
-        bench.await_boot_up(1000);
+        bench.start_program();
         bench.run_ms(20);
         set(bench);
     };

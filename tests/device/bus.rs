@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE};
+use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::{Doing, Session};
 use coflash_core::update::{flash, Event, FlashOptions};
@@ -27,11 +27,7 @@ const INTERMISSION: Span = Span(3 * BIT.0);
 
 /// A board in its bootloader, without a program, at 1 Mbit/s.
 fn fast_board() -> Bench {
-    let mut bench = Bench::new();
-    bench.commission(bench.device, NODE, BitRate::K1000);
-    bench.set_host_bit_rate(1_000_000);
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::at_rate(BitRate::K1000);
     bench.run_ms(10);
     bench
 }
@@ -201,7 +197,7 @@ fn a_bus_full_of_foreign_frames_costs_no_sdo_frame() {
         loaded.len()
     );
     assert_eq!(lost_frames(&bench, from), 0);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    assert_eq!(bench.text(0x100A), "1.0.0");
     bench.assert_nothing_unmodelled();
 }
 
@@ -213,8 +209,7 @@ fn receive_interrupts(bench: &mut Bench) -> u64 {
 
 /// Emergencies that report lost frames: 8110h.
 fn lost_frames(bench: &Bench, from: Time) -> usize {
-    let emergencies = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE));
-    emergencies.filter(|(.., data)| data[..2] == [0x10, 0x81]).count()
+    bench.emergencies(from).iter().filter(|data| data[..2] == [0x10, 0x81]).count()
 }
 
 /// The most frames that a client may send without waiting, as fast as the wire carries them.
@@ -286,8 +281,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
 
 /// The times of the device's heartbeats on the bus.
 fn heartbeats(bench: &Bench, from: Time) -> Vec<Time> {
-    let beats = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x700 + u32::from(NODE));
-    beats.map(|(at, ..)| at).collect()
+    bench.frames_of(HEARTBEAT, from).into_iter().map(|(at, _)| at).collect()
 }
 
 #[test]

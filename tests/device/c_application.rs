@@ -94,12 +94,6 @@ fn put(bench: &mut Bench, at: Address, value: u32) {
     session.write(at, &value.to_le_bytes(), Doing::Write(at), &mut |_| {}).unwrap();
 }
 
-fn power_cycle(bench: &mut Bench) {
-    bench.power_cycle();
-    bench.await_program(1000);
-    bench.events();
-}
-
 /// What a call did.
 struct Called {
     status: i32,
@@ -342,9 +336,7 @@ fn a_journal_that_is_nearly_full_refuses_what_can_wait_and_the_next_start_makes_
     }
     assert_eq!(bench.machine().counters().sectors_erased, erased, "a call erased a sector");
 
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     let from = bench.await_boot_up(100);
     // COMPACTION, whatever a master asks that greets each device; it does not keep the program.
     assert_eq!(number(&mut bench, Address::new(0x2007, 2)), 14);
@@ -393,11 +385,8 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
     for selector in [0, 8, 9, 0x7FFF_FFFF, 0x8000_0001, u32::MAX] {
         // The selector is looked at first: no pointer makes another one of it.
         for pointer in [good, 0] {
-            assert_eq!(
-                call_with(&mut bench, selector, pointer, [1; 5]).status,
-                UNKNOWN_SELECTOR,
-                "{selector}"
-            );
+            let status = call_with(&mut bench, selector, pointer, [1; 5]).status;
+            assert_eq!(status, UNKNOWN_SELECTOR, "{selector}");
         }
     }
     let pointers = [
@@ -422,47 +411,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
             assert_eq!(status, BAD_POINTER, "{selector}, {pointer:#x}");
         }
     }
-    for (address, len) in [
-        (flash.base, 0),
-        (flash.base, flash.size + 1),
-        (flash.base, u32::MAX),
-        (flash.base - 1, 1),
-        (flash.end(), 1),
-        (flash.end() - 1, 2),
-        (flash.end() - 4, 0xF800_0000),
-        (0, 4),
-        (0x1FFF_7A10, 12),
-        (ram.base, 4),
-        (0x4002_3C00, 4),
-        (u32::MAX, 1),
-        (u32::MAX, u32::MAX),
-    ] {
-        let called = call(&mut bench, CRC32, [address, len, 3, 4, 5]);
-        assert_eq!((called.status, called.words[2]), (BAD_RANGE, 3), "{address:#x}, {len:#x}");
-    }
-    for node in [
-        [0, 125_000],
-        [128, 125_000],
-        [254, 125_000],
-        [256, 125_000],
-        [257, 125_000],
-        [u32::MAX, 125_000],
-        [5, 1],
-        [5, 125_001],
-        [5, u32::MAX],
-    ] {
-        let called = call(&mut bench, STORE_NODE, [node[0], node[1], 3, 4, 5]);
-        assert_eq!(called.status, BAD_ARGUMENT, "{node:?}");
-    }
-    for selector in [PROGRAM_INFO, CONFIRM, INVALIDATE, UNCONFIRM] {
-        let absent = layout.programs.len() as u32 + 1;
-        for program in [0, absent, 254, 255, 256, 257, u32::MAX] {
-            let status = call(&mut bench, selector, [program; 5]).status;
-            // 255 is the bootloader, of which there is information alone.
-            let is_own = program == 255 && selector == PROGRAM_INFO && firmware::board().staging.is_some();
-            assert_eq!(status, if is_own { OK } else { BAD_ARGUMENT }, "{selector}, program {program}");
-        }
-    }
+    hostile_arguments(&mut bench);
     // Somebody has the flash controller open.
     put(&mut bench, probe::FLASH_OPEN, 1);
     for (selector, words) in [
@@ -482,9 +431,55 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
     assert!(bench.machine().flash() == before, "flash was changed");
     assert_eq!(bench.events(), [], "the device went down");
     assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [1, 125_000]);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
+}
+
+/// Ranges, node parameters and programs that are not there.
+fn hostile_arguments(bench: &mut Bench) {
+    let layout = firmware::board();
+    let (flash, ram) = (layout.chip.flash, layout.chip.sram);
+    for (address, len) in [
+        (flash.base, 0),
+        (flash.base, flash.size + 1),
+        (flash.base, u32::MAX),
+        (flash.base - 1, 1),
+        (flash.end(), 1),
+        (flash.end() - 1, 2),
+        (flash.end() - 4, 0xF800_0000),
+        (0, 4),
+        (0x1FFF_7A10, 12),
+        (ram.base, 4),
+        (0x4002_3C00, 4),
+        (u32::MAX, 1),
+        (u32::MAX, u32::MAX),
+    ] {
+        let called = call(bench, CRC32, [address, len, 3, 4, 5]);
+        assert_eq!((called.status, called.words[2]), (BAD_RANGE, 3), "{address:#x}, {len:#x}");
+    }
+    for node in [
+        [0, 125_000],
+        [128, 125_000],
+        [254, 125_000],
+        [256, 125_000],
+        [257, 125_000],
+        [u32::MAX, 125_000],
+        [5, 1],
+        [5, 125_001],
+        [5, u32::MAX],
+    ] {
+        let called = call(bench, STORE_NODE, [node[0], node[1], 3, 4, 5]);
+        assert_eq!(called.status, BAD_ARGUMENT, "{node:?}");
+    }
+    for selector in [PROGRAM_INFO, CONFIRM, INVALIDATE, UNCONFIRM] {
+        let absent = layout.programs.len() as u32 + 1;
+        for program in [0, absent, 254, 255, 256, 257, u32::MAX] {
+            let status = call(bench, selector, [program; 5]).status;
+            // 255 is the bootloader, of which there is information alone.
+            let is_own = program == 255 && selector == PROGRAM_INFO && firmware::board().staging.is_some();
+            assert_eq!(status, if is_own { OK } else { BAD_ARGUMENT }, "{selector}, program {program}");
+        }
+    }
 }
 
 #[test]
@@ -509,14 +504,8 @@ fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
 #[test]
 fn a_flash_that_refuses_is_told_and_harms_nothing() {
     let (mut bench, report) = running_board();
-    let sectors: Vec<u8> = {
-        let chip = firmware::board().chip;
-        firmware::board().parameters.map(|region| chip.sector_at(region.base).unwrap().number).into()
-    };
     let before = bench.machine().flash().to_vec();
-    for sector in &sectors {
-        bench.machine().protect_sector(*sector, true);
-    }
+    bench.protect_parameters(true);
     // Twice: a refusal leaves the flash controller as it was, or the next call would report that
     // it is busy.
     for _ in 0..2 {
@@ -531,9 +520,7 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
     assert_eq!(call(&mut bench, CRC32, [firmware::board().programs[0].base, 4, 0, 0, 0]).status, OK);
     assert!(bench.machine().flash() == before, "flash was changed");
 
-    for sector in &sectors {
-        bench.machine().protect_sector(*sector, false);
-    }
+    bench.protect_parameters(false);
     assert_eq!(call(&mut bench, STORE_NODE, [9, 250_000, 3, 4, 5]).status, OK);
     assert_eq!(call(&mut bench, READ_NODE, [0; 5]).words[..2], [9, 250_000]);
     assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
@@ -555,18 +542,18 @@ fn a_trial_confirms_itself_and_takes_it_back() {
         assert_eq!(call(bench, PROGRAM_INFO, [1; 5]).words[4], 0b01, "installed, not signed");
     };
     start_unsigned(&mut bench);
-    power_cycle(&mut bench);
+    bench.restart();
     assert!(bench.is_bootloader(NODE), "it had not confirmed itself");
     start_unsigned(&mut bench);
     assert_eq!(call(&mut bench, CONFIRM, [1; 5]).status, OK);
-    power_cycle(&mut bench);
+    bench.restart();
     assert!(!bench.is_bootloader(NODE), "it had");
     for _ in 0..2 {
         assert_eq!(call(&mut bench, UNCONFIRM, [1; 5]).status, OK);
         assert_eq!(call(&mut bench, PROGRAM_INFO, [1; 5]).words[4], 0b11, "still signed");
     }
     assert_eq!(call(&mut bench, INVALIDATE, [1; 5]).status, OK);
-    power_cycle(&mut bench);
+    bench.restart();
     assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
@@ -609,9 +596,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     println!("{refused}");
     let status = number(&mut bench, Address::new(0x1F57, 1));
     assert_eq!(status & 0xFF, 0x04, "FORMAT: {refused}");
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(1000);
     assert!(bench.is_bootloader(NODE));
 
@@ -623,8 +608,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     for selector in [CONFIRM, INVALIDATE, UNCONFIRM] {
         assert_eq!(call(&mut bench, selector, [2; 5]).status, NO_PROGRAM);
     }
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     let options = Options::default().region(strict(2));
     let blocks = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().program;
     let second = FlashOptions::default().program(2).trial_run(false);

@@ -2,12 +2,8 @@
 //! firmware in virtual time, with frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3
 //! and the SYS TEC manual.
 
-use std::time::Duration;
-
-use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
-use coboot_can::Adapter;
-use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
+use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::{Doing, Transfers};
 use emulator::time::{Span, Time};
@@ -24,28 +20,29 @@ const MAN_BUSY: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0x00, 0x00, 0x08];
 
 /// A board in its bootloader, without a program, at this bit rate.
 fn board(rate: BitRate) -> Bench {
-    let mut bench = Bench::new();
-    if rate != BitRate::K125 {
-        bench.commission(bench.device, NODE, rate);
-        bench.set_host_bit_rate(rate.bits_per_second().expect("a rate"));
-    }
-    bench.power_on();
-    bench.await_boot_up(100);
+    let mut bench = Bench::at_rate(rate);
     bench.run_ms(50);
+    bench
+}
+
+/// A board whose program was called back.
+fn called_back() -> Bench {
+    let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
+    bench.call_back();
+    bench.run_ms(20);
     bench
 }
 
 /// The device's frames on its SDO channel, with their time after `from`.
 fn said(bench: &Bench, from: Time) -> Vec<(Span, Vec<u8>)> {
-    let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE);
-    frames.map(|(at, _, data)| (at - from, data)).collect()
+    bench.frames_of(RESPONSE, from).into_iter().map(|(at, data)| (at - from, data)).collect()
 }
 
 /// A block download is granted in sub-blocks of `blksize`, and its first segments are sent. Returns the
 /// time of the last one on the bus.
 fn abandon(bench: &mut Bench, at: Address, blksize: u8, segments: u8) -> Time {
     // Earlier frames were already checked.
-    while bench.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
+    bench.forget_received();
     let [low, high] = at.index.to_le_bytes();
     let granted = bench.ask(REQUEST, &[0xC0, low, high, at.sub, 0, 0, 0, 0], RESPONSE).expect("an answer");
     assert_eq!(granted, [0xA4, low, high, at.sub, blksize, 0, 0, 0]);
@@ -53,18 +50,11 @@ fn abandon(bench: &mut Bench, at: Address, blksize: u8, segments: u8) -> Time {
     for seqno in 1..=segments {
         bench.post(REQUEST, &[seqno, 0, 0, 0, 0, 0, 0, 0]);
     }
-    let sent = |bench: &Bench| {
-        let segments = bench.frames_since(from);
-        segments
-            .into_iter()
-            .filter(|(_, id, _)| *id == u32::from(REQUEST))
-            .map(|(at, ..)| at)
-            .collect::<Vec<_>>()
-    };
+    let sent = |bench: &Bench| bench.frames_of(REQUEST.into(), from);
     while sent(bench).len() < usize::from(segments) {
         bench.run_ms(1);
     }
-    sent(bench).last().copied().unwrap_or(from)
+    sent(bench).last().map_or(from, |(at, _)| *at)
 }
 
 /// Default clients wait 0.3 s (python-canopen) to 0.5 s for an acknowledgement.
@@ -156,8 +146,7 @@ fn reset_node_waits_for_no_transfer() {
     ] {
         let is_bootloader = bench.is_bootloader(NODE);
         if index == 0x1F50 && !is_bootloader {
-            bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
-            bench.await_boot_up(1000);
+            bench.call_back();
             bench.run_ms(20);
         }
         for _ in 0..3 {
@@ -178,10 +167,7 @@ fn reset_node_waits_for_no_transfer() {
 /// carried out.
 #[test]
 fn uploads_that_are_never_ended_do_not_keep_the_program_from_starting() {
-    let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
-    bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
-    bench.await_boot_up(1000);
-    bench.run_ms(20);
+    let mut bench = called_back();
     assert!(bench.ask(REQUEST, &READ_1008, RESPONSE).is_some());
     bench.post(REQUEST, &[0x2F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
     let from = bench.time();
@@ -189,14 +175,10 @@ fn uploads_that_are_never_ended_do_not_keep_the_program_from_starting() {
         bench.post(REQUEST, &READ_1008);
         bench.run_ms(30);
     }
-    let boot_ups: Vec<Span> = bench
-        .frames_since(from)
-        .into_iter()
-        .filter(|(_, id, data)| *id == 0x700 + u32::from(NODE) && data[..] == [0])
-        .map(|(at, ..)| at - from)
-        .collect();
+    let mut boot_ups = bench.frames_of(HEARTBEAT, from);
+    boot_ups.retain(|(_, data)| data[..] == [0]);
     assert_eq!(boot_ups.len(), 1, "{boot_ups:?}");
-    assert!(boot_ups[0] <= Span::from_millis(60), "{:?}", boot_ups[0]);
+    assert!(boot_ups[0].0 - from <= Span::from_millis(60), "{boot_ups:?}");
     assert!(!bench.is_bootloader(NODE));
 }
 
@@ -205,10 +187,7 @@ fn uploads_that_are_never_ended_do_not_keep_the_program_from_starting() {
 #[test]
 fn behind_a_cut_raw_image_the_status_says_busy_while_commands_are_refused() {
     for command in [0x01, 0x02, 0x83] {
-        let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
-        bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
-        bench.await_boot_up(1000);
-        bench.run_ms(20);
+        let mut bench = called_back();
         assert!(bench.ask(REQUEST, &CLEAR, RESPONSE).is_some());
         let mut image = firmware::raw(firmware::APP_V2);
         image.truncate(2100);

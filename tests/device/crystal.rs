@@ -1,14 +1,12 @@
 //! A board whose crystal has failed: the bootloader runs from the internal oscillator, whose error CAN
 //! does not tolerate (2007h/5, and the choice `crystal_failure` of the product).
 
-use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{dead_crystal, firmware};
 use emulator::bus::Outcome;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::Time;
 
-const CLOCK: Address = Address::new(0x2007, 5);
 /// The emergency after the boot-up (CiA 301 section 7.2.7: COB-ID 80h + node-ID).
 const EMERGENCY: u32 = 0x80 + NODE as u32;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
@@ -20,16 +18,7 @@ fn failed(image: &str) -> Bench {
 
 /// The reason in the emergency after the boot-up.
 fn announced(bench: &Bench) -> Option<u8> {
-    let mut frames = bench.frames_since(Time(0)).into_iter();
-    frames.find(|(_, id, _)| *id == EMERGENCY).map(|(_, _, data)| data[7])
-}
-
-#[test]
-fn with_its_crystal_a_device_says_so() {
-    let mut bench = Bench::new().switched_on();
-    bench.run_ms(5);
-    assert_eq!(announced(&bench), Some(6), "no program");
-    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 1);
+    bench.emergencies(Time(0)).first().map(|data| data[7])
 }
 
 /// Another node acknowledges the host's frames.
@@ -60,7 +49,7 @@ fn without_its_crystal_a_device_only_listens_until_lss_speaks() {
     let said = bench.frames_since(from);
     assert!(said.iter().any(|(_, id, data)| *id == HEARTBEAT && data == &[0]), "{said:X?}");
     assert_eq!(announced(&bench), Some(0x80 | 6));
-    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+    assert_eq!(bench.number(0x2007, 5), 2);
 }
 
 /// The rescue window of a device that cannot answer ends as if nobody had asked.
@@ -85,13 +74,11 @@ fn a_request_that_is_not_heard_does_not_keep_a_device_from_its_program() {
 }
 
 #[test]
-fn the_template_leaves_for_the_bootloader_when_its_crystal_fails() {
-    dead_crystal::brings_the_bootloader(&firmware::blocks(firmware::APP_V1));
-}
-
-#[test]
-fn the_application_in_c_leaves_for_the_bootloader_when_its_crystal_fails() {
-    dead_crystal::brings_the_bootloader(&firmware::blocks(firmware::APP_C));
+fn the_applications_leave_for_the_bootloader_when_their_crystal_fails() {
+    for image in [firmware::APP_V1, firmware::APP_C] {
+        println!("{image}");
+        dead_crystal::brings_the_bootloader(&firmware::blocks(image));
+    }
 }
 
 /// Nobody acknowledges the host: its frames are good only when it is error passive (ISO 11898-1).
@@ -127,13 +114,13 @@ fn a_crystal_that_stops_is_a_watchdog_reset_and_then_silence_until_lss_speaks() 
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
     assert_eq!(answer.as_deref(), Some(&[0x5E, NODE, 0, 0, 0, 0, 0, 0][..]));
-    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+    assert_eq!(bench.number(0x2007, 5), 2);
 
     bench.power_off();
     bench.machine().set_crystal(bsp::CLOCK_TREE.hse);
     bench.power_on();
     bench.await_boot_up(100);
-    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 1);
+    assert_eq!(bench.number(0x2007, 5), 1);
 }
 
 #[test]
@@ -142,5 +129,5 @@ fn a_product_that_is_to_speak_in_any_case_does_and_says_so() {
     bench.power_on();
     bench.await_boot_up(200);
     bench.run_ms(20);
-    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+    assert_eq!(bench.number(0x2007, 5), 2);
 }

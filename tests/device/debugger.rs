@@ -1,25 +1,22 @@
 //! The debugger interface, 1025h, of the built images: memory access over the bus in bootloader and
 //! application, and breakpoints while the bus continues.
 
-use std::process::Command;
 use std::time::Duration;
 
 use canopen::debugger::Stop as DebugStop;
 use canopen::Address;
 use coboot_tests::bench::{Bench, HEARTBEAT, NODE};
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::{firmware, script};
+use coboot_tests::{firmware, script, tools};
 use coflash_core::device::debugger::{Debugger, NoBreakpoint, Stopped};
 use coflash_core::device::Doing;
 use coflash_core::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
-use object::{Object, ObjectSymbol};
 
 const COMMAND: Address = Address::new(0x1025, 1);
 const STATUS: Address = Address::new(0x1025, 2);
 const DATA: Address = Address::new(0x1025, 4);
-const EMERGENCY: u32 = 0x80 + NODE as u32;
 
 // The core's registers (DDI 0403E section C1).
 const FP_CTRL: u32 = 0xE000_2000;
@@ -97,15 +94,6 @@ fn seen(bench: &mut Bench, address: u32, len: usize) -> Vec<u8> {
     bytes
 }
 
-fn emergencies(bench: &Bench, from: Time) -> Vec<Vec<u8>> {
-    bench
-        .frames_since(from)
-        .into_iter()
-        .filter(|(_, id, _)| *id == EMERGENCY)
-        .map(|(.., data)| data)
-        .collect()
-}
-
 /// 6200h, no error in the error register, the type, the address (the table of the five bytes in the
 /// document).
 fn stop_of_type(kind: u8, address: u32) -> Vec<u8> {
@@ -124,12 +112,19 @@ fn break_at(bench: &mut Bench, address: u32) -> Time {
 /// Runs until an emergency is sent, for at most two seconds.
 fn await_stop(bench: &mut Bench, from: Time) -> Vec<u8> {
     for _ in 0..1000 {
-        if let Some(stop) = emergencies(bench, from).pop() {
+        if let Some(stop) = bench.emergencies(from).pop() {
             return stop;
         }
         bench.run_ms(2);
     }
     panic!("the program does not stop; heard: {:?}", bench.frames_since(from));
+}
+
+/// The program stops at this address. A code breakpoint is of type 1.
+#[track_caller]
+fn stop_at(bench: &mut Bench, address: u32) {
+    let from = break_at(bench, address);
+    assert_eq!(await_stop(bench, from), stop_of_type(1, address));
 }
 
 #[test]
@@ -298,15 +293,6 @@ fn the_scripts_of_the_document_are_played() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The standard images do not have this object.
-#[test]
-fn without_the_feature_there_is_no_interface() {
-    let mut bench = Bench::new().switched_on();
-    assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
-    bench.install(firmware::APP_V1);
-    assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
-}
-
 /// A variable at run time, without stopping the program.
 #[test]
 fn the_application_is_looked_at_while_it_runs() {
@@ -338,26 +324,21 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
         bench.run_ms(3000);
         // The program is stopped; heartbeats (every 500 ms), SDO and memory access continue.
         assert_eq!(read_word(&mut bench, calls), stopped_with);
-        let beats: Vec<Time> = bench
-            .frames_since(from)
-            .into_iter()
-            .filter(|(_, id, _)| *id == HEARTBEAT)
-            .map(|(at, ..)| at)
-            .collect();
+        let beats = bench.frames_of(HEARTBEAT, from);
         assert_eq!(beats.len(), 6, "{beats:?}");
         for pair in beats.windows(2) {
-            let period = (pair[1] - pair[0]).0 / 1_000_000_000;
+            let period = (pair[1].0 - pair[0].0).0 / 1_000_000_000;
             assert!((499..=503).contains(&period), "{period} ms");
         }
-        assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
-        assert_eq!(emergencies(&bench, from), Vec::<Vec<u8>>::new());
+        assert_eq!(bench.text(0x100A), "1.0.0");
+        assert_eq!(bench.emergencies(from), Vec::<Vec<u8>>::new());
         // It continues after the current instruction, and returns half a second later.
         from = bench.time();
         write_word(&mut bench, DEMCR, GO_ON);
         bench.run_ms(300);
         assert_eq!(read_word(&mut bench, DEMCR), GO_ON);
         assert_eq!(read_word(&mut bench, calls), stopped_with + 1);
-        assert_eq!(emergencies(&bench, from), Vec::<Vec<u8>>::new());
+        assert_eq!(bench.emergencies(from), Vec::<Vec<u8>>::new());
     }
     // Without the breakpoint the program runs.
     write_word(&mut bench, FP_COMP0, 0);
@@ -375,8 +356,7 @@ fn a_breakpoint_stops_the_program_and_not_the_bus() {
 fn registers_are_read_and_changed_and_steps_are_steps() {
     let mut bench = application();
     let (at, calls) = (symbol("debugger_example"), symbol("DEBUGGER_EXAMPLE_CALLS"));
-    let from = break_at(&mut bench, at);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
+    stop_at(&mut bench, at);
     let saved = read_word(&mut bench, DCRDR);
     let frame = read_word(&mut bench, saved);
     assert_eq!(frame, saved + 40, "the core's part lies behind the handler's ten words");
@@ -447,17 +427,12 @@ fn a_program_is_stopped_on_request_and_goes_on() {
 #[test]
 fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     let mut bench = application();
-    let elf = firmware::elf(firmware::APP_DEBUGGER);
-    let file = object::File::parse(&*elf).unwrap();
-    let is_idle = |name: &str| name.contains("3app4idle17h");
-    let idle = file.symbols().find(|symbol| symbol.name().is_ok_and(is_idle)).expect("idle");
-    let idle = idle.address() as u32 & !1;
+    let idle = firmware::symbol(firmware::APP_DEBUGGER, |name| name.contains("3app4idle17h"));
     // WFI is BF30h.
     let code = seen(&mut bench, idle, 64);
     let wfi = (0..64).step_by(2).find(|&n| code[n..n + 2] == [0x30, 0xBF]).expect("it sleeps");
     let wfi = idle + wfi as u32;
-    let from = break_at(&mut bench, wfi);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, wfi));
+    stop_at(&mut bench, wfi);
     let next = wfi + 2;
     let half = if next & 2 == 0 { 1 << 30 } else { 1 << 31 };
     write_word(&mut bench, FP_COMP0 + 4, half | next & !3 | 1);
@@ -484,7 +459,7 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
     let from = bench.time();
     break_at(&mut bench, at);
     bench.run_ms(100);
-    assert_eq!(emergencies(&bench, from), [stop_of_type(0x81, at)]);
+    assert_eq!(bench.emergencies(from), [stop_of_type(0x81, at)]);
     assert_eq!(read_word(&mut bench, FP_CTRL), 0x260, "off");
     assert_eq!(read_word(&mut bench, DEMCR) & STOPPED, 0);
     let calls = symbol("DEBUGGER_EXAMPLE_CALLS");
@@ -493,8 +468,7 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
     assert!(read_word(&mut bench, calls) >= before + 3);
     // The next breakpoint, which is possible, works.
     let at = symbol("debugger_example");
-    let from = break_at(&mut bench, at);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
+    stop_at(&mut bench, at);
     assert_eq!(bench.events(), [], "no reset");
 }
 
@@ -504,8 +478,7 @@ fn a_breakpoint_out_of_reach_harms_nothing() {
 fn a_fault_restarts_the_device_as_ever() {
     let mut bench = application();
     let at = symbol("debugger_example");
-    let from = break_at(&mut bench, at);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
+    stop_at(&mut bench, at);
     let saved = read_word(&mut bench, DCRDR);
     let frame = read_word(&mut bench, saved);
     write_word(&mut bench, frame + 24, 0x6000_0000);
@@ -514,9 +487,9 @@ fn a_fault_restarts_the_device_as_ever() {
     let [a, b, c, d] = GO_ON.to_le_bytes();
     bench.post(0x600 + u16::from(NODE), &[0x23, 0x25, 0x10, 0x04, a, b, c, d]);
     bench.await_boot_up(1000);
-    let stops: Vec<Stop> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    let stops = bench.stops();
     assert_eq!(stops, [Stop::Reset(ResetCause::Software)]);
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert!(!bench.is_bootloader(NODE));
     let calls = symbol("DEBUGGER_EXAMPLE_CALLS");
     bench.run_ms(2000);
     assert!(read_word(&mut bench, calls) >= 2);
@@ -528,23 +501,19 @@ fn a_fault_restarts_the_device_as_ever() {
 fn a_stopped_program_can_be_reset_and_called_back() {
     let mut bench = application();
     let at = symbol("debugger_example");
-    let from = break_at(&mut bench, at);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
+    stop_at(&mut bench, at);
     // NMT reset node.
     bench.post(0x000, &[0x81, NODE]);
     bench.await_boot_up(1000);
     bench.run_ms(2000);
     assert_eq!(read_word(&mut bench, FP_CTRL), 0x260);
     assert_eq!(bench.events().len(), 1, "the one reset");
-    let from = break_at(&mut bench, at);
-    assert_eq!(await_stop(&mut bench, from), stop_of_type(1, at));
-    bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
-    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
-    bench.session().command(1, canopen::program::ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    stop_at(&mut bench, at);
+    bench.call_back();
+    assert!(bench.is_bootloader(NODE));
+    bench.start_program();
     bench.run_ms(2000);
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert!(!bench.is_bootloader(NODE));
     assert_eq!(bench.events().len(), 2, "to the bootloader, and back");
 }
 
@@ -623,10 +592,8 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
 
 /// Runs `coflash debug`; returns exit code, standard output and standard error.
 fn debug(endpoint: &mut Endpoint, words: &[&str]) -> (Option<i32>, String, String) {
-    let coflash = std::env::var_os("COBOOT_COFLASH")
-        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
-    let mut command = Command::new(coflash);
-    command.arg("debug").args(words).env_remove("COFLASH_CONFIG").env("COFLASH_BUS", endpoint.url());
+    let mut command = tools::coflash();
+    command.arg("debug").args(words).env("COFLASH_BUS", endpoint.url());
     let done = endpoint.run(&mut command);
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (done.status.code(), text(&done.stdout), text(&done.stderr))

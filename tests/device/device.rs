@@ -9,40 +9,25 @@ use coflash_core::update::event::Phase;
 use coflash_core::update::steps::enter_bootloader;
 use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
-use emulator::machine::{Options, ResetCause, Stop};
-use emulator::time::{Span, Time};
+use emulator::machine::Options;
+use emulator::time::Span;
 use kit::rig::block;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
-const VERSION: Address = Address::new(0x100A, 0);
-
-/// A board in its bootloader, without a program.
-pub(super) fn empty_board() -> Bench {
-    Bench::new().switched_on()
-}
+const VERSION: u16 = 0x100A;
 
 /// A board that runs version 1.
 pub(super) fn running_board() -> Bench {
-    let mut bench = empty_board();
-    install(&mut bench, firmware::APP_V1);
+    let mut bench = Bench::new().switched_on();
+    bench.update(firmware::APP_V1);
     bench
-}
-
-pub(super) fn install(bench: &mut Bench, image: &str) {
-    let file = firmware::blocks(image);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
-}
-
-pub(super) fn call_back(bench: &mut Bench) {
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
 }
 
 /// Saves the flash of program 1, to detect changes.
 fn program_flash(bench: &mut Bench) -> Vec<u8> {
-    bench.machine().flash()[(program_start() - firmware::board().chip.flash.base) as usize..].to_vec()
+    bench.machine().flash()[firmware::program_offset()..].to_vec()
 }
 
 /// The address of program 1.
@@ -65,7 +50,7 @@ fn send(bench: &mut Bench, block: &[u8]) -> (Option<u32>, u32) {
 
 #[test]
 fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
     let blank = program_flash(&mut bench);
@@ -95,7 +80,7 @@ fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
 
 #[test]
 fn the_largest_block_of_the_manual_is_taken() {
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
@@ -108,7 +93,7 @@ fn the_largest_block_of_the_manual_is_taken() {
 
 #[test]
 fn commands_without_a_program_and_unknown_ones() {
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     for command in [ProgramControl::Start, ProgramControl::SetSignature] {
         bench.session().command(1, command).unwrap();
         let status = bench.session().await_idle(1, Doing::Command(command)).unwrap();
@@ -123,7 +108,7 @@ fn commands_without_a_program_and_unknown_ones() {
 
 #[test]
 fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, then
@@ -138,9 +123,9 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
     let from = bench.time();
     bench.run_ms(5000);
-    let said: Vec<_> = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE).collect();
+    let said = bench.frames_of(RESPONSE, from);
     assert_eq!(said.len(), 1, "{said:?}");
-    assert_eq!(said[0].2, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
+    assert_eq!(said[0].1, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
     assert_eq!(send(&mut bench, &block(1, program_start(), &firmware::made_up(1000, |_| 7))), (None, 0));
 }
 
@@ -151,7 +136,7 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
     let mut untouched = 0;
     for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2100] {
         let mut bench = running_board();
-        call_back(&mut bench);
+        bench.call_back();
         let file = firmware::blocks(firmware::APP_V2);
         // The host cuts the power by its own clock: the update is abandoned at that time, then the
         // power is cut.
@@ -170,12 +155,12 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
         assert!(matches!(outcome, Err(Error::Cancelled)), "cut at {after_ms} ms: {outcome:?}");
         bench.power_cycle();
         bench.await_program(1000);
-        if !bench.session().device_type().unwrap().unwrap().is_bootloader() {
-            assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0", "cut at {after_ms} ms");
+        if !bench.is_bootloader(NODE) {
+            assert_eq!(bench.text(VERSION), "1.0.0", "cut at {after_ms} ms");
             untouched += 1;
         }
-        install(&mut bench, firmware::APP_V2);
-        assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "cut at {after_ms} ms");
+        bench.update(firmware::APP_V2);
+        assert_eq!(bench.text(VERSION), "2.0.0", "cut at {after_ms} ms");
         bench.assert_nothing_unmodelled();
     }
     assert!(
@@ -186,7 +171,7 @@ fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
 
 #[test]
 fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_start_by_itself() {
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     let file = firmware::blocks(firmware::APP_V1);
     let options = FlashOptions::default();
     let mut trial_passed = false;
@@ -199,36 +184,15 @@ fn a_trial_run_comes_back_to_the_bootloader_and_an_unsigned_program_does_not_sta
     enter_bootloader(&mut bench.session(), &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::ClrSignature).unwrap();
     bench.session().await_idle(1, Doing::Command(ProgramControl::ClrSignature)).unwrap();
-    let running = |bench: &mut Bench| {
+    let stays = |bench: &mut Bench| {
         bench.power_cycle();
         bench.await_boot_up(1000);
-        bench.session().device_type().unwrap().unwrap()
+        bench.is_bootloader(NODE)
     };
-    assert!(running(&mut bench).is_bootloader());
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader(), "started on request, for once");
-    assert!(running(&mut bench).is_bootloader(), "and not again");
-}
-
-/// The promise of 1F51h = 80h: the answer is on the bus, then at least 10 ms pass, then the device
-/// resets.
-#[test]
-fn the_answer_to_the_call_back_is_on_the_bus_well_before_the_reset() {
-    let mut bench = running_board();
-    bench.events();
-    let from = bench.time();
-    call_back(&mut bench);
-    // A receiver has a frame one bit before its end.
-    bench.run_ms(1);
-    let frames = bench.frames_since(from);
-    let answer = frames.iter().find(|(_, id, _)| *id == RESPONSE).expect("an answer");
-    assert_eq!(answer.2, [0x60, 0x51, 0x1F, 0x01, 0, 0, 0, 0]);
-    let events = bench.events();
-    let [(reset, Stop::Reset(ResetCause::Software))] = events[..] else { panic!("{events:?}") };
-    assert!(reset - answer.0 >= Span::from_millis(10), "answered at {}, reset at {reset}", answer.0);
-    let boot_up = frames.iter().find(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).expect("a boot-up");
-    assert!(boot_up.0 > reset);
+    assert!(stays(&mut bench));
+    bench.start_program();
+    assert!(!bench.is_bootloader(NODE), "started on request, for once");
+    assert!(stays(&mut bench), "and not again");
 }
 
 /// Reads 1F57h every 7 ms until it is not busy; returns the longest time until an answer, and the
@@ -254,7 +218,7 @@ fn slowest_answer(bench: &mut Bench) -> (Span, u32) {
 #[test]
 fn never_silent_during_an_erase() {
     let mut bench = running_board();
-    call_back(&mut bench);
+    bench.call_back();
     bench.soil_programs();
     let from = bench.time();
     // Twice in a row: erase everything at once.
@@ -264,17 +228,12 @@ fn never_silent_during_an_erase() {
     assert!(busy > 300, "the erase must have lasted: {busy} busy answers");
     // Both frames of the exchange are part of the measured time.
     assert!(slowest <= Span::from_millis(5), "{} us", slowest.0 / 1_000_000);
-    let beats: Vec<Time> = bench
-        .frames_since(from)
-        .into_iter()
-        .filter(|(_, id, _)| *id == HEARTBEAT)
-        .map(|(at, ..)| at)
-        .collect();
+    let beats = bench.frames_of(HEARTBEAT, from);
     // Typical erase times (DS8626 table 39 and similar): a second for 128 KiB.
     let seconds = (firmware::board().programs[0].size / (128 * 1024)) as usize;
     assert!(beats.len() >= seconds, "{beats:?}");
     for pair in beats.windows(2) {
-        let period = pair[1] - pair[0];
+        let period = pair[1].0 - pair[0].0;
         assert!((900..=1100).contains(&(period.0 / 1_000_000_000)), "{} ms", period.0 / 1_000_000_000);
     }
     assert_eq!(bench.machine().counters().flash_stalls, 0);
@@ -290,18 +249,18 @@ fn the_entry_strap_holds_the_device_in_the_bootloader() {
     }
     bench.power_on();
     bench.await_boot_up(1000);
-    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert!(bench.is_bootloader(NODE));
     press(bench.machine(), false);
     bench.power_off();
     bench.power_on();
     bench.await_program(1000);
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert!(!bench.is_bootloader(NODE));
 }
 
 #[test]
 fn nmt_resets_restart_the_device_or_the_communication() {
     let mut bench = running_board();
-    call_back(&mut bench);
+    bench.call_back();
     bench.events();
     // Reset communication (82h) to this node: a boot-up message, and no reset of the chip.
     let boot_up = bench.ask(0, &[0x82, NODE], HEARTBEAT);
@@ -319,7 +278,7 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     assert_eq!(bench.events(), []);
     bench.post(0, &[0x81, 0]);
     bench.await_boot_up(1000);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    assert_eq!(bench.text(VERSION), "1.0.0");
 }
 
 /// Noise in the RAM at power-on (including the warm-start cell and the handoff) is not a request.
@@ -332,8 +291,7 @@ fn noise_in_the_ram_is_no_request() {
         bench.machine().load_bin(firmware::board().chip.flash.base, &flash_image).unwrap();
         bench.power_on();
         bench.await_program(1000);
-        let running = bench.session().device_type().unwrap().unwrap();
-        assert!(!running.is_bootloader(), "seed {seed}: the program starts as after any power-on");
+        assert!(!bench.is_bootloader(NODE), "seed {seed}: the program starts as after any power-on");
     }
 }
 
@@ -342,7 +300,7 @@ fn noise_in_the_ram_is_no_request() {
 #[test]
 fn code_left_in_flash_would_not_answer_in_time() {
     let mut bench = running_board();
-    call_back(&mut bench);
+    bench.call_back();
     // After the bootloader's image, in its own flash. ARMv7-M A7.7.44: ldr.w pc, [pc, #0], and the
     // address after it.
     let stub_address = firmware::board().bootloader.end() - 0x100;
@@ -353,10 +311,7 @@ fn code_left_in_flash_would_not_answer_in_time() {
     let stub = [&[0xDF, 0xF8, 0x00, 0xF0], &handler[..]].concat();
     bench.machine().load_bin(stub_address, &stub).unwrap();
     bench.machine().write_ram(vector, &(stub_address | 1).to_le_bytes()).unwrap();
-    assert!(
-        bench.session().device_type().unwrap().unwrap().is_bootloader(),
-        "it works as long as nothing is erased"
-    );
+    assert!(bench.is_bootloader(NODE), "it works as long as nothing is erased");
 
     bench.session().command(1, ProgramControl::Clear).unwrap();
     bench.post(REQUEST, &[0x2F, 0x51, 0x1F, 0x01, 0x03, 0, 0, 0]);

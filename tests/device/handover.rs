@@ -76,7 +76,7 @@ fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
 /// interrupts.
 #[test]
 fn the_bootloader_finds_the_chip_as_after_a_reset() {
-    let mut bench = crate::device::empty_board();
+    let mut bench = Bench::new().switched_on();
     bench.install(firmware::APP_TEST);
     bench.events();
     bench.session().write(REENTRY_PATH, &[JUMP], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();

@@ -3,17 +3,15 @@
 
 mod gdb;
 
-use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::{press, Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use kit::rig::crc32;
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, Object, ObjectSection, ObjectSymbol};
 use shared_abi::abilities::Abilities;
+use shared_abi::check_word;
 use shared_abi::geometry::Region;
 use shared_abi::layout::toml::Toml;
 use shared_abi::ram_image::{Header, Host, SERVICES_VERSION};
@@ -253,14 +251,21 @@ fn load(bench: &mut Bench, parts: &Parts) {
     bench.machine().load_bin(parts.home, &parts.image).unwrap();
 }
 
+/// A new board with these parts, in its bootloader.
+fn started(parts: &Parts) -> Bench {
+    let mut bench = Bench::new();
+    load(&mut bench, parts);
+    let mut bench = bench.switched_on();
+    assert!(bench.is_bootloader(NODE));
+    bench
+}
+
 /// The warm-start cell as a debugger reads it: request and argument, if it is valid.
 fn cell(bench: &Bench) -> Option<(u32, u32)> {
     let mut bytes = [0; 16];
     bench.world.machine(bench.device).read_memory(firmware::board().warm_start.base, &mut bytes).unwrap();
     let [magic, request, argument, check] = words(&bytes)[..] else { unreachable!("16 bytes") };
-    // The fold of the ABI, implemented again.
-    let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
-    let sound = check == !words(&bytes)[..3].iter().fold(0xC0B0_07A5, fold);
+    let sound = check == check_word(&[magic, request, argument]);
     (magic == u32::from_le_bytes(*b"CBW1") && sound).then_some((request, argument))
 }
 
@@ -344,13 +349,12 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
         assert!(!bench.is_bootloader(NODE), "{what}: the start of a program needs nothing of the image");
         assert_eq!(cell(&bench), None, "{what}");
         bench.events();
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         assert_eq!(bench.events().len(), 1, "{what}: one reset");
         assert!(!bench.is_bootloader(NODE), "{what}");
         assert_eq!(cell(&bench), Some((DAMAGED, damage)), "{what}");
         // The application reads it through the callgate.
-        let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
+        let crc = bench.number(0x1F56, 1);
         assert_eq!(crc, firmware::blocks(firmware::APP_V1).crc(), "{what}");
         // It starts as before, with the cell consumed.
         bench.machine().reset_pin();
@@ -381,8 +385,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     bench.power_on();
     bench.await_boot_up(1000);
     bench.await_boot_up(1000);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), None);
 }
@@ -487,25 +490,12 @@ fn a_damaged_image_without_a_program_resets_again_and_again() {
         }
         // A debugger finds it there at almost any time.
         assert!(seen > 70, "{what}: {seen} times of 80");
-        let resets: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        let resets = bench.stops();
         assert!((3..=6).contains(&resets.len()), "{what}: {} resets in 400 ms", resets.len());
         assert!(resets.iter().all(|stop| *stop == Stop::Reset(ResetCause::Software)), "{what}");
         assert!(bench.records().is_empty(), "{what}: nothing on the bus");
         bench.assert_nothing_unmodelled();
     }
-}
-
-/// The image from the linker, without a CRC: the result of `cargo build` alone. It differs from the
-/// one of `cargo xtask build` in this word alone.
-#[test]
-fn an_image_without_a_crc_runs() {
-    let mut image = Parts::of(firmware::BOOTLOADER_LEAST);
-    image.set(CRC, 0);
-    let mut bench = Bench::new();
-    load(&mut bench, &image);
-    bench.power_on();
-    bench.await_boot_up(100);
-    assert!(bench.is_bootloader(NODE));
 }
 
 /// The products of the tests by what their resident parts decide by (bootloader/products): those of a row have the
@@ -568,18 +558,13 @@ fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
     for resident in names {
         for image in names.into_iter().filter(|image| *image != resident) {
             let parts = Parts { resident: Parts::of(resident).resident, ..Parts::of(image) };
-            let mut bench = Bench::new();
-            load(&mut bench, &parts);
-            bench.power_on();
-            bench.await_boot_up(100);
-            assert!(bench.is_bootloader(NODE), "{image} on {resident}");
+            println!("{image} on {resident}");
+            let mut bench = started(&parts);
             // The image erases, programs and stores by the services of the other resident part.
-            let options = FlashOptions::default().trial_run(false);
-            flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+            bench.install(firmware::APP_V1);
             bench.confirm_program();
             assert!(!bench.is_bootloader(NODE), "{image} on {resident}");
-            bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-            bench.await_boot_up(1000);
+            bench.call_back();
             assert!(bench.is_bootloader(NODE), "{image} on {resident}");
         }
     }
@@ -604,18 +589,18 @@ fn an_image_takes_longer_tables_than_it_knows() {
         parts.seal();
         parts
     };
-    let (older, newer) = (with(SERVICES, 0), with(RESERVED, 1));
-    for (what, parts) in
-        [("a newer resident part", longer), ("an older image", older), ("a later header", newer)]
-    {
-        let mut bench = Bench::new();
-        load(&mut bench, &parts);
-        bench.power_on();
-        bench.await_boot_up(100);
-        assert!(bench.is_bootloader(NODE), "{what}");
-        let options = FlashOptions::default();
-        flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
-            .unwrap_or_else(|error| panic!("{what}: {error}"));
+    // The result of `cargo build` alone, which differs from that of `cargo xtask build` in this word alone.
+    let mut of_linker = good.clone();
+    of_linker.set(CRC, 0);
+    for (what, parts) in [
+        ("a newer resident part", longer),
+        ("an older image", with(SERVICES, 0)),
+        ("a later header", with(RESERVED, 1)),
+        ("an image without a CRC", of_linker),
+    ] {
+        println!("{what}");
+        let mut bench = started(&parts);
+        bench.update(firmware::APP_V1);
         assert!(!bench.is_bootloader(NODE), "{what}");
     }
 }

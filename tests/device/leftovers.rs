@@ -56,119 +56,92 @@ const CAN1: u32 = 0x4000_6400;
 /// PWR, CAN1, WWDG, TIM2.
 const APB1_CLOCKS: u32 = 1 << 28 | 1 << 25 | 1 << 11 | 1 << 0;
 
+const fn wrong(what: &'static str, stores: &'static [(u32, u32)], core: u32) -> Wrong {
+    Wrong { what, stores, core }
+}
+
 /// Registers by RM0090, and by ARMv7-M those of the core.
+#[rustfmt::skip]
 const WRONG: [Wrong; 21] = [
-    Wrong { what: "PRIMASK and FAULTMASK set", stores: &[], core: INTERRUPTS_OFF | FAULTS_MASKED },
-    Wrong { what: "BASEPRI set", stores: &[], core: PRIORITIES_MASKED },
-    Wrong { what: "on the process stack", stores: &[], core: PROCESS_STACK },
-    Wrong { what: "FPU in use", stores: &[(0xE000_ED88, 0x00F0_0000)], core: FPU_USED },
-    Wrong { what: "in a handler", stores: &[], core: FROM_A_HANDLER },
-    Wrong {
-        what: "every interrupt enabled, some pending, TIM2 and SysTick run",
-        stores: &[
-            (APB1ENR, APB1_CLOCKS),
-            (0x4000_002C, 60_000), // TIM2: ARR, DIER, CR1
-            (0x4000_000C, 1),
-            (0x4000_0000, 1),
-            (0xE000_E014, 60_000), // SYST_RVR, SYST_CSR
-            (0xE000_E010, 7),
-            (0xE000_E100, u32::MAX), // ISER0 to 2, ISPR0
-            (0xE000_E104, u32::MAX),
-            (0xE000_E108, u32::MAX),
-            (0xE000_E200, u32::MAX),
-        ],
-        core: INTERRUPTS_OFF,
-    },
-    Wrong {
-        what: "VTOR in RAM, unaligned accesses and divisions by 0 fault",
-        stores: &[(0xE000_ED08, 0x2000_0000), (0xE000_ED14, 0x218)],
-        core: 0,
-    },
-    Wrong {
-        what: "SLEEPDEEP and SLEEPONEXIT, and Standby chosen",
-        stores: &[(APB1ENR, APB1_CLOCKS), (0x4000_7000, 0xC006), (0xE000_ED10, 6)],
-        core: 0,
-    },
-    Wrong {
-        what: "in sleep no peripheral has a clock, the PLL's is spread by 3 %, SysTick has a large count",
-        stores: &[
-            (RCC + 0x50, 0), // The LPENRs
-            (RCC + 0x54, 0),
-            (RCC + 0x58, 0),
-            (RCC + 0x60, 0),
-            (RCC + 0x64, 0),
-            (RCC + 0x80, 0xC010_60FA), // SSCGR (RM0090 section 7.3.23)
-            (0xE000_E014, 0x00FF_FFFF),
-            (0xE000_E018, 0),
-            (0xE000_E010, 5),
-        ],
-        core: 0,
-    },
+    wrong("PRIMASK and FAULTMASK set", &[], INTERRUPTS_OFF | FAULTS_MASKED),
+    wrong("BASEPRI set", &[], PRIORITIES_MASKED),
+    wrong("on the process stack", &[], PROCESS_STACK),
+    wrong("FPU in use", &[(0xE000_ED88, 0x00F0_0000)], FPU_USED),
+    wrong("in a handler", &[], FROM_A_HANDLER),
+    wrong("every interrupt enabled, some pending, TIM2 and SysTick run", &[
+        (APB1ENR, APB1_CLOCKS),
+        (0x4000_002C, 60_000), // TIM2: ARR, DIER, CR1
+        (0x4000_000C, 1),
+        (0x4000_0000, 1),
+        (0xE000_E014, 60_000), // SYST_RVR, SYST_CSR
+        (0xE000_E010, 7),
+        (0xE000_E100, u32::MAX), // ISER0 to 2, ISPR0
+        (0xE000_E104, u32::MAX),
+        (0xE000_E108, u32::MAX),
+        (0xE000_E200, u32::MAX),
+    ], INTERRUPTS_OFF),
+    wrong("VTOR in RAM, unaligned accesses and divisions by 0 fault", &[
+        (0xE000_ED08, 0x2000_0000), (0xE000_ED14, 0x218),
+    ], 0),
+    wrong("SLEEPDEEP and SLEEPONEXIT, and Standby chosen", &[
+        (APB1ENR, APB1_CLOCKS), (0x4000_7000, 0xC006), (0xE000_ED10, 6),
+    ], 0),
+    wrong("in sleep no peripheral has a clock, the PLL's is spread by 3 %, SysTick has a large count", &[
+        (RCC + 0x50, 0), // The LPENRs
+        (RCC + 0x54, 0),
+        (RCC + 0x58, 0),
+        (RCC + 0x60, 0),
+        (RCC + 0x64, 0),
+        (RCC + 0x80, 0xC010_60FA), // SSCGR (RM0090 section 7.3.23)
+        (0xE000_E014, 0x00FF_FFFF),
+        (0xE000_E018, 0),
+        (0xE000_E010, 5),
+    ], 0),
     // After an interrupt the core would sleep again, and no work on the flash would be done (B1.5.17).
-    Wrong { what: "SLEEPONEXIT alone", stores: &[(SCR, 2)], core: 0 },
+    wrong("SLEEPONEXIT alone", &[(SCR, 2)], 0),
     // Each sleep would be Stop, which no interrupt of a peripheral ends (RM0090 section 5.3.5).
-    Wrong { what: "SLEEPDEEP alone", stores: &[(SCR, 4)], core: 0 },
-    Wrong {
-        what: "PendSV pending, its priority and that of SysTick the lowest, no groups of priorities",
-        stores: &[(0xE000_ED20, 0xF0F0_0000), (0xE000_ED04, 1 << 28), (0xE000_ED0C, 0x05FA_0700)],
-        core: INTERRUPTS_OFF,
-    },
-    Wrong { what: "patches, breakpoints, watchpoints and vector catches", stores: &DEBUG_UNITS, core: 0 },
-    Wrong {
-        what: "flash open for programming by bytes, its caches off",
-        stores: &[
-            (0x4002_3C04, 0x4567_0123), // KEYR, CR, ACR
-            (0x4002_3C04, 0xCDEF_89AB),
-            (0x4002_3C10, 1),
-            (0x4002_3C00, 7),
-        ],
-        core: 0,
-    },
+    wrong("SLEEPDEEP alone", &[(SCR, 4)], 0),
+    wrong("PendSV pending, its priority and that of SysTick the lowest, no groups of priorities", &[
+        (0xE000_ED20, 0xF0F0_0000), (0xE000_ED04, 1 << 28), (0xE000_ED0C, 0x05FA_0700),
+    ], INTERRUPTS_OFF),
+    wrong("patches, breakpoints, watchpoints and vector catches", &DEBUG_UNITS, 0),
+    wrong("flash open for programming by bytes, its caches off", &[
+        (0x4002_3C04, 0x4567_0123), // KEYR, CR, ACR
+        (0x4002_3C04, 0xCDEF_89AB),
+        (0x4002_3C10, 1),
+        (0x4002_3C00, 7),
+    ], 0),
     // A bus error: the program jumps from the handler of the fault.
-    Wrong { what: "option bytes shut by a wrong key", stores: &[(0x4002_3C08, 0)], core: 0 },
-    Wrong {
-        what: "voltage detector at 2.9 V with its interrupt",
-        stores: &[
-            (APB1ENR, APB1_CLOCKS),
-            (0x4000_7000, 0xC0F0),  // PWR_CR: PVDE, PLS 7
-            (0x4001_3C00, 1 << 16), // EXTI: IMR, RTSR, FTSR, SWIER
-            (0x4001_3C08, 1 << 16),
-            (0x4001_3C0C, 1 << 16),
-            (0x4001_3C10, 1 << 16),
-        ],
-        core: 0,
-    },
-    Wrong { what: "independent watchdog", stores: &[(0x4000_3000, 0xCCCC)], core: 0 },
-    Wrong { what: "window watchdog", stores: &[(APB1ENR, APB1_CLOCKS), (0x4000_2C00, 0xFF)], core: 0 },
-    Wrong {
-        what: "CAN in loop-back and silent mode with a frame to send and its interrupts",
-        stores: &[
-            (APB1ENR, APB1_CLOCKS),
-            (CAN1, 1), // MCR, BTR, MCR, IER, TI0R
-            (CAN1 + 0x1C, 0xC123_0001),
-            (CAN1, 0),
-            (CAN1 + 0x14, 0x0003_8F7F),
-            (CAN1 + 0x180, 1),
-        ],
-        core: 0,
-    },
-    Wrong {
-        what: "slow buses, the oscillator in place of the PLL, and no crystal",
-        stores: &[(0x4002_3808, 0xFCA0), (0x4002_3800, 0x83)],
-        core: 0,
-    },
-    Wrong {
-        what: "peripherals held in reset, and without clocks",
-        stores: &[
-            (0x4002_3810, 0x0000_11FF), // RSTRs
-            (0x4002_3820, 0x36FE_C9FF),
-            (0x4002_3824, 0x0007_5933),
-            (0x4002_3830, 0), // ENRs
-            (APB1ENR, 0),
-            (0x4002_3844, 0),
-        ],
-        core: 0,
-    },
+    wrong("option bytes shut by a wrong key", &[(0x4002_3C08, 0)], 0),
+    wrong("voltage detector at 2.9 V with its interrupt", &[
+        (APB1ENR, APB1_CLOCKS),
+        (0x4000_7000, 0xC0F0),  // PWR_CR: PVDE, PLS 7
+        (0x4001_3C00, 1 << 16), // EXTI: IMR, RTSR, FTSR, SWIER
+        (0x4001_3C08, 1 << 16),
+        (0x4001_3C0C, 1 << 16),
+        (0x4001_3C10, 1 << 16),
+    ], 0),
+    wrong("independent watchdog", &[(0x4000_3000, 0xCCCC)], 0),
+    wrong("window watchdog", &[(APB1ENR, APB1_CLOCKS), (0x4000_2C00, 0xFF)], 0),
+    wrong("CAN in loop-back and silent mode with a frame to send and its interrupts", &[
+        (APB1ENR, APB1_CLOCKS),
+        (CAN1, 1), // MCR, BTR, MCR, IER, TI0R
+        (CAN1 + 0x1C, 0xC123_0001),
+        (CAN1, 0),
+        (CAN1 + 0x14, 0x0003_8F7F),
+        (CAN1 + 0x180, 1),
+    ], 0),
+    wrong("slow buses, the oscillator in place of the PLL, and no crystal", &[
+        (0x4002_3808, 0xFCA0), (0x4002_3800, 0x83),
+    ], 0),
+    wrong("peripherals held in reset, and without clocks", &[
+        (0x4002_3810, 0x0000_11FF), // RSTRs
+        (0x4002_3820, 0x36FE_C9FF),
+        (0x4002_3824, 0x0007_5933),
+        (0x4002_3830, 0), // ENRs
+        (APB1ENR, 0),
+        (0x4002_3844, 0),
+    ], 0),
 ];
 
 const SCR: u32 = 0xE000_ED10;
@@ -336,7 +309,7 @@ fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
         bench.session().command(1, ProgramControl::Start).unwrap();
         // A second of the watchdog at 32 kHz, and a rescue window.
         bench.run_ms(2_000);
-        let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        let stops = bench.stops();
         let stops = &stops[..stops.len().min(4)];
         println!("{}: {stops:?}", wrong.what);
         let answer = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], RESPONSE);
@@ -378,15 +351,12 @@ fn a_program_that_leaves_the_caches_of_the_flash_on_does_no_harm() {
 fn plays_the_main_job_after(wrong: &Wrong, register: u32, bits: u32) {
     let mut bench = board_with(wrong);
     bench.fill_journal(0);
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1_000);
+    bench.start_program();
     bench.run_ms(500);
     let left_on = bench.machine().register(register).unwrap() & bits;
     bench.install(firmware::APP_V1);
     assert!(!bench.is_bootloader(NODE));
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1_000);
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(left_on, 0, "{}: the bootloader needs none", wrong.what);

@@ -4,12 +4,11 @@
 
 use std::time::Duration;
 
-use canopen::{Address, BitRate, NodeId};
+use canopen::{Address, BitRate};
 use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::update::{flash, FlashOptions};
+use coflash_core::device::Doing;
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::bus::Outcome;
 use emulator::frame::Frame;
@@ -24,12 +23,6 @@ fn empty_board() -> Bench {
     // The emergency after the boot-up message.
     bench.run_ms(5);
     bench
-}
-
-fn restart(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
 }
 
 /// An LSS request with an answer.
@@ -58,40 +51,6 @@ fn boot_up(bench: &Bench, node: u8, since: Time) -> Option<Time> {
     bench.frames_since(since).iter().find(said).map(|frame| frame.0)
 }
 
-fn emergencies(bench: &Bench, since: Time) -> Vec<Vec<u8>> {
-    let id = 0x80 + u32::from(NODE);
-    bench.frames_since(since).into_iter().filter(|frame| frame.1 == id).map(|frame| frame.2).collect()
-}
-
-fn session(bench: &mut Bench, node: u8) -> Session<'_> {
-    Session::new(bench, NodeId::new(node).expect("1 to 127"), Timing::default())
-}
-
-fn is_bootloader(session: &mut Session<'_>) -> bool {
-    session.device_type().unwrap().expect("a device type").is_bootloader()
-}
-
-#[test]
-fn stored_node_id_and_bit_rate_serve_bootloader_and_application_after_a_reset() {
-    let mut bench = empty_board();
-    store(&mut bench, 42, BitRate::K500);
-    restart(&mut bench);
-    bench.set_host_bit_rate(500_000);
-    let from = bench.time();
-    bench.run_ms(50);
-    assert!(boot_up(&bench, 42, from).is_some(), "{:?}", bench.frames_since(from));
-
-    let file = firmware::blocks(firmware::APP_V1);
-    let from = bench.time();
-    flash(&mut session(&mut bench, 42), &file, &FlashOptions::default().trial_run(false), &mut |_| {})
-        .unwrap();
-    assert!(boot_up(&bench, 42, from).is_some());
-    // The application reports the same by LSS.
-    configuration_state(&mut bench);
-    assert_eq!(lss(&mut bench, [0x5E, 0, 0, 0, 0, 0, 0, 0]), [0x5E, 42, 0, 0, 0, 0, 0, 0]);
-    bench.assert_nothing_unmodelled();
-}
-
 #[test]
 fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
     for (index, rate) in [
@@ -106,7 +65,7 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
     ] {
         let mut bench = empty_board();
         store(&mut bench, 3, BitRate::from_index(index).unwrap());
-        restart(&mut bench);
+        bench.power_cycle();
         bench.set_host_bit_rate(rate);
         let from = bench.time();
         bench.run_ms(100);
@@ -127,7 +86,7 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
 fn a_device_without_node_id_is_silent_until_it_gets_one() {
     let mut bench = empty_board();
     store(&mut bench, 0xFF, BitRate::K125);
-    restart(&mut bench);
+    bench.power_cycle();
     let from = bench.time();
     bench.run_ms(3000);
     // NMT and SDO need a node-ID.
@@ -147,7 +106,7 @@ fn a_device_without_node_id_is_silent_until_it_gets_one() {
     bench.post(LSS_REQUEST, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
     bench.run_ms(20);
     assert!(boot_up(&bench, 7, from).is_some(), "{:?}", bench.frames_since(from));
-    assert!(is_bootloader(&mut session(&mut bench, 7)));
+    assert!(bench.is_bootloader(7));
 }
 
 #[test]
@@ -164,7 +123,7 @@ fn a_bit_rate_is_activated_after_the_delay() {
     assert!(bench.time() - asked >= Span::from_millis(100));
     bench.run_ms(250);
     // It was not stored, and the device did not restart.
-    assert!(is_bootloader(&mut bench.session()));
+    assert!(bench.is_bootloader(NODE));
     assert_eq!(boot_up(&bench, NODE, asked), None);
 }
 
@@ -186,7 +145,7 @@ fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
     for rate in [1_000_000, 250_000, 50_000] {
         let mut bench = empty_board();
         store(&mut bench, NODE, BitRate::Auto);
-        restart(&mut bench);
+        bench.power_cycle();
         bench.set_host_bit_rate(rate);
         // Another node of that bus acknowledges; the host sends every 20 ms.
         bench.world.add_host_port(rate);
@@ -200,7 +159,7 @@ fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
         let records = bench.records();
         let bad = records.iter().filter(|record| record.start >= from && record.outcome != Outcome::Good);
         assert_eq!(bad.count(), 0, "{rate} bit/s: a listener destroyed frames");
-        assert!(is_bootloader(&mut bench.session()));
+        assert!(bench.is_bootloader(NODE));
     }
 }
 
@@ -210,7 +169,7 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
     for rate in [1_000_000, 250_000, 20_000] {
         let mut bench = empty_board();
         store(&mut bench, NODE, BitRate::Auto);
-        restart(&mut bench);
+        bench.power_cycle();
         bench.set_host_bit_rate(rate);
         let from = bench.time();
         bench.run_ms(2000);
@@ -218,7 +177,7 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
         // One request, which no node acknowledges at first.
         bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
         assert!(found_after(&mut bench, 5000).is_some(), "{rate} bit/s not found");
-        assert!(is_bootloader(&mut bench.session()));
+        assert!(bench.is_bootloader(NODE));
     }
 }
 
@@ -227,26 +186,22 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
 fn an_application_finds_the_bit_rate_too() {
     let mut bench = empty_board();
     bench.install(firmware::APP_V1);
-    bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     store(&mut bench, NODE, BitRate::Auto);
-    restart(&mut bench);
+    bench.power_cycle();
     bench.set_host_bit_rate(500_000);
     bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
     let found = found_after(&mut bench, 5000);
     assert!(found.is_some());
-    assert!(!is_bootloader(&mut bench.session()));
+    assert!(!bench.is_bootloader(NODE));
 }
 
 #[test]
 fn the_boot_up_of_the_bootloader_is_followed_by_an_emergency() {
-    let bench = {
-        let mut bench = empty_board();
-        bench.run_ms(20);
-        bench
-    };
+    let mut bench = empty_board();
+    bench.run_ms(20);
     // Device specific, no error in the register, "BOOT", and the reason: no program.
-    assert_eq!(emergencies(&bench, Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 6]]);
+    assert_eq!(bench.emergencies(Time::default()), [[0x00, 0xFF, 0, b'B', b'O', b'O', b'T', 6]]);
 }
 
 #[test]
@@ -271,10 +226,10 @@ fn comes_back_from_bus_off_with_growing_patience_and_tells() {
     bench.world.clear_faults();
     let from = bench.time();
     bench.run_ms(5500);
-    let told = emergencies(&bench, from);
-    assert!(told.iter().any(|bytes| bytes[..3] == [0x40, 0x81, 0x11]), "{told:02X?}");
-    assert_eq!(told.last().unwrap()[..3], [0x00, 0x00, 0x00], "and it is over: {told:02X?}");
-    assert!(is_bootloader(&mut bench.session()));
+    let emergencies = bench.emergencies(from);
+    assert!(emergencies.iter().any(|bytes| bytes[..3] == [0x40, 0x81, 0x11]), "{emergencies:02X?}");
+    assert_eq!(emergencies.last().unwrap()[..3], [0x00, 0x00, 0x00], "and it is over: {emergencies:02X?}");
+    assert!(bench.is_bootloader(NODE));
     // 1003h, newest first.
     let history = bench.ask(0x601, &[0x40, 0x03, 0x10, 1, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(history[..6], [0x43, 0x03, 0x10, 1, 0x40, 0x81]);
@@ -312,13 +267,13 @@ fn error_passive_is_told_and_its_end_too() {
     }
     bench.world.clear_faults();
     bench.run_ms(50);
-    assert_eq!(emergencies(&bench, from)[0][..3], [0x20, 0x81, 0x11]);
+    assert_eq!(bench.emergencies(from)[0][..3], [0x20, 0x81, 0x11]);
     // Each successful frame decreases the counter by one; the heartbeats do so in time.
     for _ in 0..64 {
         bench.ask(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
     }
     bench.run_ms(50);
-    assert_eq!(emergencies(&bench, from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
+    assert_eq!(bench.emergencies(from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
 }
 
 #[test]
@@ -332,7 +287,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     let doing = coflash_core::device::Doing::Block(0);
     bench.session().write(address, &block, doing, &mut |_| {}).unwrap_err();
     bench.run_ms(20);
-    assert_eq!(emergencies(&bench, from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);
+    assert_eq!(bench.emergencies(from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);
     let register = bench.ask(0x601, &[0x40, 0x01, 0x10, 0, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(register[4], 0x81);
     // Twice: this erases, and succeeds.
@@ -340,7 +295,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     bench.session().await_idle(1, doing).unwrap();
     bench.run_ms(20);
-    assert_eq!(emergencies(&bench, from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
+    assert_eq!(bench.emergencies(from).last().unwrap()[..3], [0x00, 0x00, 0x00]);
 }
 
 #[test]
@@ -349,7 +304,7 @@ fn frames_lost_in_a_flood_are_told_once() {
     // It computes a CRC of 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
     let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16).switched_on();
     store(&mut bench, NODE, BitRate::K1000);
-    restart(&mut bench);
+    bench.power_cycle();
     bench.set_host_bit_rate(1_000_000);
     bench.run_ms(50);
     let mut image = firmware::raw(firmware::APP_V1);
@@ -367,8 +322,8 @@ fn frames_lost_in_a_flood_are_told_once() {
         bench.run_ms(50);
     }
     bench.run_ms(2000);
-    let told = emergencies(&bench, from);
-    let lost: Vec<_> = told.iter().filter(|bytes| bytes[..2] == [0x10, 0x81]).collect();
+    let emergencies = bench.emergencies(from);
+    let lost: Vec<_> = emergencies.iter().filter(|bytes| bytes[..2] == [0x10, 0x81]).collect();
     assert!((1..=3).contains(&lost.len()), "more than one a second, or none: {lost:02X?}");
     // Bytes 5 and 6: the driver's status, 0020h and 1000h.
     assert!(
@@ -377,7 +332,7 @@ fn frames_lost_in_a_flood_are_told_once() {
     );
     // The abort of the block, which was not read yet.
     while bench.receive(Duration::ZERO).unwrap().is_some() {}
-    assert!(is_bootloader(&mut bench.session()));
+    assert!(bench.is_bootloader(NODE));
 }
 
 /// Code in flash stops while the journal is erased (RM0090 section 3.5.1), and the watchdog with it.
@@ -388,7 +343,7 @@ fn a_value_that_comes_while_the_journal_is_erased_does_not_stop_the_core() {
         store(&mut bench, NODE, BitRate::K125);
         // From 256 used places on it is compacted at once.
         bench.fill_journal(300);
-        restart(&mut bench);
+        bench.power_cycle();
         bench.run_ms(ms);
         configuration_state(&mut bench);
         bench.post(LSS_REQUEST, &[0x11, 9, 0, 0, 0, 0, 0, 0]);
@@ -396,7 +351,7 @@ fn a_value_that_comes_while_the_journal_is_erased_does_not_stop_the_core() {
         bench.post(LSS_REQUEST, &[0x17, 0, 0, 0, 0, 0, 0, 0]);
         bench.run_ms(500);
         assert_eq!(bench.machine().counters().flash_stalls, 0, "{ms} ms");
-        restart(&mut bench);
+        bench.power_cycle();
         let from = bench.time();
         bench.run_ms(50);
         assert!(boot_up(&bench, 9, from).is_some(), "{ms} ms: it is stored");

@@ -30,14 +30,14 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
         let mut bench = Bench::of_image(image).switched_on();
         bench.run_ms(10);
         assert_eq!(
-            listener.told(&mut bench),
+            listener.lines(&mut bench),
             ["stayed in the bootloader; why 00000006", "emergency; code and detail FF000042"]
         );
 
         bench.session().command(1, ProgramControl::Start).unwrap();
         bench.run_ms(10);
         assert_eq!(
-            listener.told(&mut bench),
+            listener.lines(&mut bench),
             ["1F51h; program and command 00000101", "1F57h; program and status 00010002"]
         );
 
@@ -45,7 +45,7 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
         bench.post(0x600 + u16::from(NODE), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
         bench.run_ms(10);
         assert_eq!(
-            listener.told(&mut bench),
+            listener.lines(&mut bench),
             ["1F51h; program and command 0000017F", "refused; abort code 06090030"]
         );
 
@@ -53,7 +53,7 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
         bench.post(0x000, &[0x81, 0]);
         bench.run_ms(10);
         let longest = longest_between_feeds(&mut bench);
-        let lines = listener.told(&mut bench);
+        let lines = listener.lines(&mut bench);
         assert_eq!(lines.len(), 2, "{lines:?}");
         assert_eq!(lines[0], "leaving; request 00000005");
         assert_same_time(&lines[1], longest);
@@ -82,7 +82,7 @@ fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
     /// ARMv7-M A7.7.12: a branch to itself.
     const HANG: [u8; 2] = 0xE7FE_u16.to_le_bytes();
     let said = |listener: &mut Listener, bench: &mut Bench| {
-        let lines = listener.told(bench).into_iter();
+        let lines = listener.lines(bench).into_iter();
         let mut lines: Vec<_> = lines.filter(|line| line.starts_with("longest ")).collect();
         assert_eq!(lines.len(), 1, "{lines:?}");
         lines.remove(0)
@@ -94,7 +94,7 @@ fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
         let file = firmware::blocks(firmware::APP_V1);
         flash(&mut bench.session(), &file, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
         // Room for the lines to come.
-        listener.told(&mut bench);
+        listener.lines(&mut bench);
         bench.session().command(1, ProgramControl::Start).unwrap();
         // Two lines on a UART take 6 ms; the reset comes 15 ms after the answer.
         bench.run_ms(9);
@@ -148,7 +148,7 @@ fn nobody_waits_for_who_reads_it() {
             bench.run_ms(2);
         }
         bench.run_ms(200);
-        let lines = listener.told(&mut bench);
+        let lines = listener.lines(&mut bench);
         // 202 lines were logged; a kibibyte holds about 25 of them as text, and 150 as frames.
         assert!((20..190).contains(&lines.len()), "{}", lines.len());
         // None of them is truncated.
@@ -167,8 +167,7 @@ fn nobody_waits_for_who_reads_it() {
 fn the_uart_speaks_while_the_flash_erases() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART).switched_on();
     bench.install(firmware::APP_V1);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     bench.soil_programs();
     // Twice in a row: erase everything at once.
     bench.session().command(1, ProgramControl::Clear).unwrap();
@@ -181,7 +180,7 @@ fn the_uart_speaks_while_the_flash_erases() {
         // Two frames at 125 kbit/s, 2 ms; 67 characters, 5.9 ms.
         bench.run_ms(9);
         assert_eq!(
-            terminal.told(&mut bench),
+            terminal.lines(&mut bench),
             ["1F51h; program and command 0000017F", "refused; abort code 06090030"]
         );
     }
@@ -199,8 +198,8 @@ fn frames_that_mean_nothing_are_told_as_such() {
             decoder.messages(frame);
         }
     }
-    let told = decoder.messages(&[0xFF, 0xFF, 0xFF, 0]);
-    assert_eq!(told, ["a frame of defmt that this program's ELF file does not explain"]);
+    let messages = decoder.messages(&[0xFF, 0xFF, 0xFF, 0]);
+    assert_eq!(messages, ["a frame of defmt that this program's ELF file does not explain"]);
     assert!(decoder.messages(&vec![0x55; 100_000]).is_empty());
     assert!(Decoder::of_elf(&firmware::elf(firmware::BOOTLOADER)).unwrap().is_none());
     assert!(Decoder::of_elf(b"no ELF file").is_err());

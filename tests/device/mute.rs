@@ -3,9 +3,11 @@
 
 use std::time::Duration;
 
-use coboot_can::{Adapter, AdapterError};
+use canopen::NodeId;
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::fleet::Eventful;
 use coflash_core::device::error::TrialFailure;
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::convert::{program_of, Options};
@@ -32,10 +34,6 @@ fn mute() -> Program {
     program_of(image, &Options::default()).unwrap().program
 }
 
-fn board() -> Bench {
-    Bench::new().switched_on()
-}
-
 fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate) {
     let mut left = None;
     let error = flash(&mut bench.session(), mute(), options, &mut |event| {
@@ -46,58 +44,26 @@ fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate
     (error.unwrap_err(), left.expect("how it was left"))
 }
 
-/// A bench with boards that get power at this time, while the host sends requests.
-struct Later<'b> {
-    bench: &'b mut Bench,
-    on: Option<Duration>,
-}
-
-impl Later<'_> {
-    fn tick(&mut self) {
-        if self.on.is_some_and(|on| self.bench.now() >= on) {
-            self.on = None;
-            self.bench.power_on();
-        }
-    }
-}
-
-impl Adapter for Later<'_> {
-    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
-        self.tick();
-        self.bench.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
-        self.tick();
-        let until = self.bench.now() + timeout;
-        if let Some(on) = self.on.filter(|on| *on <= until) {
-            if let Some(frame) = self.bench.receive(on - self.bench.now())? {
-                return Ok(Some(frame));
-            }
-            self.tick();
-        }
-        self.bench.receive(until.saturating_sub(self.bench.now()))
-    }
-
-    fn now(&self) -> Duration {
-        self.bench.now()
-    }
-}
-
 /// Switches the board off, starts the requests, and switches the board on.
 fn caught(bench: &mut Bench, options: CatchOptions) -> Caught {
     bench.power_off();
     bench.run_ms(100);
-    let on = Some(bench.now() + DARK);
-    let mut later = Later { bench, on };
-    let node = canopen::NodeId::new(NODE).unwrap();
-    let mut session = Session::new(&mut later, node, Timing::default());
+    let on = bench.now() + DARK;
+    let mut is_on = false;
+    let mut happens = |bench: &mut Bench| {
+        if !is_on && bench.now() >= on {
+            is_on = true;
+            bench.power_on();
+        }
+    };
+    let mut bus = Eventful { bench, happens: &mut happens };
+    let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
     catch(&mut session, &options.within(Some(DARK * 2)), &mut |_| {}).unwrap()
 }
 
 #[test]
 fn a_mute_program_is_not_released_and_the_device_comes_back() {
-    let mut bench = board();
+    let mut bench = Bench::new().switched_on();
     let (error, left) = fails(&mut bench, &FlashOptions::default());
     assert!(matches!(error, Error::TrialFailed { how: TrialFailure::Silent(_), .. }), "{error}");
     assert!(error.to_string().contains("not released for autostart"), "{error}");
@@ -106,8 +72,7 @@ fn a_mute_program_is_not_released_and_the_device_comes_back() {
     let caught = caught(&mut bench, CatchOptions::default());
     assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
     // The next update needs nothing else.
-    flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
+    bench.update(firmware::APP_V1);
     assert!(!bench.is_bootloader(NODE));
     bench.assert_nothing_unmodelled();
 }
@@ -115,7 +80,7 @@ fn a_mute_program_is_not_released_and_the_device_comes_back() {
 #[test]
 fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
     for options in [CatchOptions::default(), CatchOptions::default().any(true)] {
-        let mut bench = board();
+        let mut bench = Bench::new().switched_on();
         let (error, left) = fails(&mut bench, &FlashOptions::default().trial_run(false));
         assert!(matches!(error, Error::StartFailed { running: None, .. }), "{error}");
         assert_eq!((left.state, left.answer), (DeviceState::Released, DeviceAnswer::Silent));
@@ -128,7 +93,7 @@ fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
         }
         assert!(bench.session().device_type().unwrap().is_none(), "the program runs");
         let caught = caught(&mut bench, options);
-        assert_eq!(caught.node.map(canopen::NodeId::get), Some(NODE));
+        assert_eq!(caught.node.map(NodeId::get), Some(NODE));
         // It stays, also after a long time without requests.
         bench.run_ms(5000);
         assert!(bench.is_bootloader(NODE));

@@ -48,7 +48,7 @@ fn device(blocks: &[(u32, [u8; 32])]) -> Bench {
         bench.machine().load_bin(OTP + 32 * block, bytes).unwrap();
     }
     bench.set_host_bit_rate(500_000);
-    set_switches(&mut bench, NODE, BitRate::K500);
+    set_switches(&mut bench, NODE, BitRate::K500 as u8);
     bench.machine().set_pin('C', 0, Some(true));
     bench.power_on();
     bench.run_ms(50);
@@ -161,13 +161,10 @@ fn a_product_without_the_choice_keeps_the_identity_of_the_board() {
     bench.machine().load_bin(OTP, &PLATE).unwrap();
     bench.power_on();
     bench.await_boot_up(100);
-    let numbers = |bench: &mut Bench| {
-        [1, 2, 3, 4].map(|sub| bench.session().read_number(Address::new(0x1018, sub)).unwrap())
-    };
+    let numbers = |bench: &mut Bench| [1, 2, 3, 4].map(|sub| bench.number(0x1018, sub));
     assert_eq!(numbers(&mut bench), of_board());
-    flash(&mut bench.session(), firmware::blocks(firmware::APP_V1), &FlashOptions::default(), &mut |_| {})
-        .unwrap();
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    bench.update(firmware::APP_V1);
+    assert!(!bench.is_bootloader(NODE));
     assert_eq!(numbers(&mut bench), of_board());
 }
 

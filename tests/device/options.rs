@@ -13,8 +13,8 @@ use emulator::time::Time;
 
 /// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the index of the bit
 /// rate on 4 to 7.
-pub(crate) fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
-    let pins = u16::from(node) << 8 | (rate as u16) << 4;
+pub(crate) fn set_switches(bench: &mut Bench, node: u8, index: u8) {
+    let pins = u16::from(node) << 8 | u16::from(index) << 4;
     for pin in 4..15 {
         bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));
     }
@@ -33,7 +33,7 @@ pub(crate) fn with<T>(bench: &mut Bench, what: impl FnOnce(&mut Session<'_>) -> 
 fn switched_on(node: u8, rate: BitRate) -> Bench {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_SWITCHES);
     bench.set_host_bit_rate(500_000);
-    set_switches(&mut bench, node, rate);
+    set_switches(&mut bench, node, rate as u8);
     bench.power_on();
     bench.run_ms(50);
     bench
@@ -67,10 +67,7 @@ fn node_id_bit_rate_and_cob_ids_are_the_products() {
 fn switches_out_of_range_stand_for_the_boards() {
     for index in [0, 7, 15] {
         let mut bench = Bench::of_image(firmware::BOOTLOADER_SWITCHES);
-        for pin in 4..15 {
-            let pins: u16 = 42 << 8 | index << 4;
-            bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));
-        }
+        set_switches(&mut bench, 42, index);
         bench.power_on();
         bench.run_ms(50);
         let answer = bench.ask(0x32A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
@@ -113,9 +110,8 @@ fn block_download_has_the_products_sub_blocks_or_is_not_there() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST).switched_on();
     let refused = bench.ask(0x601, &initiate, 0x581).unwrap();
     assert_eq!((refused[0], refused[4..].to_vec()), (0x80, vec![0x01, 0, 0x04, 0x05]));
-    let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
-    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+    bench.update(firmware::APP_V1);
+    assert!(!bench.is_bootloader(NODE));
 }
 
 /// A program gets the COB-IDs with the handoff: trial, start and call back go by the same ones.

@@ -16,16 +16,24 @@ use coflash_core::update::{catch, flash, CatchOptions, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::Stop;
 use emulator::time::{Span, Time};
+use shared_abi::check_word;
 use shared_abi::renewal::Progress;
 
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 
 fn running_board(image: &str) -> Bench {
     let mut bench = Bench::new().switched_on();
-    flash(&mut bench.session(), firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
+    bench.update(image);
     bench.run_ms(100);
     bench.events();
     bench
+}
+
+/// A command to 1F51h/1, which is acknowledged.
+#[track_caller]
+fn assert_acknowledged(bench: &mut Bench, command: u8) {
+    let answer = bench.ask(REQUEST, &control(command), RESPONSE);
+    assert_eq!(answer.as_deref(), Some(&ACKNOWLEDGED[..]), "{command:02X}h");
 }
 
 /// The time of the chip's single reset.
@@ -37,8 +45,8 @@ fn reset(bench: &mut Bench) -> Time {
 
 /// The answers since then, with the times of their ends.
 fn answers(bench: &Bench, from: Time) -> Vec<(Time, [u8; 8])> {
-    let frames = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == RESPONSE);
-    frames.map(|(at, _, data)| (at, data.try_into().expect("8 bytes"))).collect()
+    let frames = bench.frames_of(RESPONSE, from).into_iter();
+    frames.map(|(at, data)| (at, data.try_into().expect("8 bytes"))).collect()
 }
 
 /// All kinds of requests during the 10 ms between the answer and the reset are answered; frames
@@ -49,7 +57,7 @@ fn requests_between_the_answer_and_the_reset_are_served() {
         for leaving in [0x80, 0x02] {
             let mut bench = running_board(image);
             let from = bench.time();
-            assert_eq!(bench.ask(REQUEST, &control(leaving), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, leaving);
             // Frames that are not requests, or are for other nodes.
             bench.post(REQUEST, &[0x40, 0, 0x10]);
             bench.post(REQUEST, &[0x80, 0, 0x10, 0, 0, 0, 0, 0]);
@@ -83,7 +91,7 @@ fn a_call_in_quick_succession_is_acknowledged_each_time() {
         let mut bench = running_board(image);
         let from = bench.time();
         for _ in 0..4 {
-            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, 0x80);
             bench.run_ms(3);
         }
         bench.await_boot_up(1000);
@@ -113,10 +121,10 @@ fn two_masters_are_both_answered() {
         for second in [0x00, 0x03] {
             let mut bench = running_board(image);
             let from = bench.time();
-            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, 0x80);
             bench.run_ms(2);
             let asked = bench.time();
-            assert_eq!(bench.ask(REQUEST, &control(second), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, second);
             let took = bench.time() - asked;
             assert!(took <= Span::from_millis(25), "{image}, {second}: {} us", took.0 / 1_000_000);
             bench.run_ms(2);
@@ -129,11 +137,11 @@ fn two_masters_are_both_answered() {
         // device: by 2 of 1F51h, and by NMT reset node.
         for nmt in [false, true] {
             let mut bench = running_board(image);
-            assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, 0x80);
             if nmt {
                 bench.post(0x000, &[0x81, NODE]);
             } else {
-                assert_eq!(bench.ask(REQUEST, &control(0x02), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+                assert_acknowledged(&mut bench, 0x02);
             }
             bench.await_boot_up(1000);
             assert!(bench.is_bootloader(NODE), "{image}");
@@ -232,8 +240,7 @@ fn an_application_that_may_not_leave_stays_and_can_be_caught() {
         let caught = catch(&mut bench.session(), &CatchOptions::default(), &mut |_| {}).unwrap();
         assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{image}");
         // Its program is as it was, and leaves when its machine stands: it is confirmed again.
-        bench.session().command(1, ProgramControl::Start).unwrap();
-        bench.await_boot_up(1000);
+        bench.start_program();
         bench.run_ms(20);
         bench.confirm_program();
         bench.run_ms(50);
@@ -289,12 +296,7 @@ fn commands_in_segments_are_answered_by_the_application() {
 #[test]
 fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
     let magic = u32::from_le_bytes(*b"CBW1");
-    // The fold of the ABI, implemented again.
-    let check = |words: [u32; 3]| {
-        let fold = |fold: u32, word: &u32| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1);
-        !words.iter().fold(0xC0B0_07A5_u32, fold)
-    };
-    let sound = |argument: u32| [magic, 7, argument, check([magic, 7, argument])];
+    let sound = |argument: u32| [magic, 7, argument, check_word(&[magic, 7, argument])];
     let [.., good] = sound(0x0001_0001);
     let of_node_1 = |program: u32, value: u32| program | value << 8 | u32::from(NODE) << 16;
     let abort = |program: u8, code: [u8; 4]| {
@@ -316,8 +318,7 @@ fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
         ("an impossible node", sound(1 | 3 << 8 | 200 << 16), true, None),
     ] {
         let mut bench = running_board(firmware::APP_V1);
-        let bytes: Vec<u8> = cell.iter().flat_map(|word| word.to_le_bytes()).collect();
-        bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
+        bench.set_warm_start(cell);
         let from = bench.time();
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
@@ -349,8 +350,7 @@ fn fresh_board(image: &str) -> Bench {
     let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
     raw_download(&mut bench, NODE, image);
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    bench.start_program();
     bench.run_ms(50);
     bench.events();
     bench
@@ -363,12 +363,12 @@ fn the_first_80h_to_a_fresh_program_confirms_it() {
         let mut bench = fresh_board(image);
         // After any other request it stays fresh.
         bench.post(0x000, &[0x80, NODE]);
-        assert_eq!(bench.session().read_number(canopen::Address::new(0x1F51, 1)).unwrap(), 1);
-        assert_eq!(bench.ask(REQUEST, &control(0x01), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
-        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_eq!(bench.number(0x1F51, 1), 1);
+        assert_acknowledged(&mut bench, 0x01);
+        assert_acknowledged(&mut bench, 0x80);
         bench.run_ms(600);
         assert_eq!(bench.events(), [], "{image}: it stays");
-        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+        assert_acknowledged(&mut bench, 0x80);
         bench.await_boot_up(1000);
         assert!(bench.is_bootloader(NODE), "{image}: the second is a call");
     }
@@ -411,13 +411,12 @@ fn every_other_80h_is_a_call() {
         // The erase of a sector of 128 KiB takes a second of it.
         assert!(bench.time() - began < Span::from_millis(4000), "{image}: nobody was asked twice");
         // Released by SYS TEC's command after a download in one transfer.
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         for value in [0x03, 0x83] {
             if value == 0x83 {
                 raw_download(&mut bench, NODE, image);
             }
-            assert_eq!(bench.ask(REQUEST, &control(value), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+            assert_acknowledged(&mut bench, value);
         }
         bench.run_ms(100);
         assert!(bench.ask(REQUEST, &control(0x01), RESPONSE).is_some());
@@ -435,19 +434,11 @@ fn every_other_80h_is_a_call() {
 fn a_confirmation_that_fails_is_told_and_leaves_the_way_back_open() {
     for image in APPLICATIONS {
         let mut bench = fresh_board(image);
-        let sectors: Vec<u8> = {
-            let chip = firmware::board().chip;
-            firmware::board().parameters.map(|region| chip.sector_at(region.base).unwrap().number).into()
-        };
-        for sector in &sectors {
-            bench.machine().protect_sector(*sector, true);
-        }
+        bench.protect_parameters(true);
         let refused = bench.ask(REQUEST, &control(0x80), RESPONSE);
         assert_eq!(refused.as_deref(), Some(&[0x80, 0x51, 0x1F, 1, 0, 0, 0x06, 0x06][..]), "{image}");
-        for sector in &sectors {
-            bench.machine().protect_sector(*sector, false);
-        }
-        assert_eq!(bench.ask(REQUEST, &control(0x80), RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+        bench.protect_parameters(false);
+        assert_acknowledged(&mut bench, 0x80);
         bench.await_boot_up(1000);
         assert!(bench.is_bootloader(NODE), "{image}");
     }
@@ -478,8 +469,7 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
     // A byte of the code, and the first vector.
     for (damage, reason) in [(region.base + 0x400, 9), (region.base, 10)] {
         let mut bench = running_board(firmware::APP_V1);
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         // It came back on request.
         let state = [1, 2, 3, 4].map(|sub| read(&mut bench, 0x2007, sub));
         let number = firmware::board().staging.map_or(0, |_| renewal::number());
@@ -498,13 +488,7 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
         }
         bench.await_boot_up(1000);
         // A new download brings everything back.
-        flash(
-            &mut bench.session(),
-            firmware::blocks(firmware::APP_V2),
-            &FlashOptions::default(),
-            &mut |_| {},
-        )
-        .unwrap();
+        bench.update(firmware::APP_V2);
         bench.run_ms(100);
         assert!(!bench.is_bootloader(NODE));
         bench.assert_nothing_unmodelled();

@@ -2,15 +2,16 @@
 
 use canopen::program::ProgramControl;
 use canopen::{AbortCode, Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, RESPONSE};
 use coboot_tests::{call_back, firmware};
 use coflash_core::device::Doing;
 use coflash_core::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
+use shared_abi::check_word;
 
-const VERSION: Address = Address::new(0x100A, 0);
+const VERSION: u16 = 0x100A;
 /// Objects of the tests' application: the return, and its confirmation.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const CONFIRMATION: Address = Address::new(0x2001, 0);
@@ -31,12 +32,6 @@ fn write(bench: &mut Bench, at: Address, value: u8) -> Result<(), Error> {
     bench.session().write(at, &[value], Doing::Write(at), &mut |_| {})
 }
 
-fn power_cycle(bench: &mut Bench) {
-    bench.power_cycle();
-    bench.await_program(1000);
-    bench.events();
-}
-
 /// Each way leads to a bootloader with all its functions.
 #[test]
 fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
@@ -51,17 +46,16 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
         let from = bench.time();
         bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         let boot_up = bench.await_boot_up(1000);
-        let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        let stops = bench.stops();
         assert_eq!(stops, expected, "way {way}");
-        let answer =
-            bench.frames_since(from).into_iter().find(|(_, id, _)| *id == 0x580 + u32::from(NODE)).unwrap();
-        assert!(boot_up - answer.0 >= Span::from_millis(10), "way {way}");
+        let (answered, _) = bench.frames_of(RESPONSE, from)[0];
+        assert!(boot_up - answered >= Span::from_millis(10), "way {way}");
         assert!(bench.is_bootloader(NODE), "way {way}");
 
         bench.install(firmware::APP_V2);
-        assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0", "way {way}");
+        assert_eq!(bench.text(VERSION), "2.0.0", "way {way}");
         // A request is valid once.
-        power_cycle(&mut bench);
+        bench.restart();
         assert!(!bench.is_bootloader(NODE), "way {way}");
         bench.assert_nothing_unmodelled();
     }
@@ -114,15 +108,13 @@ fn both_programs_take_interrupts_in_turn_and_none_goes_astray() {
         // SDO requests without pauses keep both CAN vectors busy until the last moment; SysTick
         // always runs.
         for _ in 0..100 {
-            bench.session().read_text(VERSION).unwrap();
+            bench.text(VERSION);
         }
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         for _ in 0..100 {
             assert!(bench.is_bootloader(NODE), "round {round}");
         }
-        bench.session().command(1, ProgramControl::Start).unwrap();
-        bench.await_boot_up(1000);
+        bench.start_program();
     }
     // Only the resets after START: no fault, no watchdog.
     let events = bench.events();
@@ -149,16 +141,15 @@ fn the_answer_comes_before_the_departure_at_every_bit_rate() {
     call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
-/// Sets another node-ID and optionally another bit rate of a node by layer setting services (CiA
-/// 305), and stores them.
-fn store_by_lss(bench: &mut Bench, node: u8, rate: Option<BitRate>) {
+/// Sets another node-ID and bit rate of a node by layer setting services (CiA 305), stores them, and restarts it.
+fn store_by_lss(bench: &mut Bench, node: u8, rate: BitRate) {
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    let rate = rate.map(|rate| [0x13, 0, rate as u8]);
-    for [command, a, b] in [Some([0x11, node, 0]), rate, Some([0x17, 0, 0])].into_iter().flatten() {
+    for [command, a, b] in [[0x11, node, 0], [0x13, 0, rate as u8], [0x17, 0, 0]] {
         let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
         assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
     }
     bench.power_cycle();
+    bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
 }
 
 /// Node-ID and bit rate set in the application also apply in the bootloader, and the other way
@@ -168,10 +159,9 @@ fn node_id_and_bit_rate_are_shared() {
     for bootloader in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
         let mut bench = Bench::of_image(bootloader).switched_on();
         bench.install(firmware::APP_V1);
-        let serial = bench.session().read_number(Address::new(0x1018, 4)).unwrap();
+        let serial = bench.number(0x1018, 4);
 
-        store_by_lss(&mut bench, 9, Some(BitRate::K250));
-        bench.set_host_bit_rate(250_000);
+        store_by_lss(&mut bench, 9, BitRate::K250);
         bench.await_program_of(9, 1000);
         if bootloader == firmware::BOOTLOADER_LEAST {
             // No program starts by itself.
@@ -187,10 +177,13 @@ fn node_id_and_bit_rate_are_shared() {
         if bootloader == firmware::BOOTLOADER_LEAST {
             continue;
         }
-        // And from the bootloader: the program gets it from the handoff.
-        store_by_lss(&mut bench, 21, None);
+        // And from the bootloader: the program gets it from the handoff, and reports it by LSS.
+        store_by_lss(&mut bench, 21, BitRate::K500);
         bench.await_boot_up_of(21, 1000);
         assert!(!bench.is_bootloader(21));
+        bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+        let node_id = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
+        assert_eq!(node_id.as_deref(), Some(&[0x5E, 21, 0, 0, 0, 0, 0, 0][..]));
         assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
     }
 }
@@ -208,17 +201,12 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         bench.power_on();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE));
-        assert_eq!(
-            bench.session().read_number(Address::new(0x1F56, 1)).unwrap(),
-            0,
-            "no CRC without a callgate"
-        );
+        assert_eq!(bench.number(0x1F56, 1), 0, "no CRC without a callgate");
         // 08000022h: not in this state of the device.
         let refused = bench.session().read_number(CONFIRMATION).unwrap_err();
         assert!(matches!(refused, Error::Refused { code: AbortCode::DEVICE_STATE, .. }), "{refused:?}");
         assert!(write(&mut bench, CONFIRMATION, SIGNED as u8).is_err());
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         assert!(bench.is_bootloader(NODE));
     }
 }
@@ -229,15 +217,20 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
 fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     let mut bench = running_board();
     for reset in 1..=3 {
-        bench.events();
+        let from = bench.time();
+        // An application that started the watchdog and then hangs: LSI / 4, 8 ms.
         bench.machine().preset_watchdog(64);
         bench.run_ms(300);
+        assert_eq!(bench.stops(), [Stop::Reset(ResetCause::IndependentWatchdog)], "{reset}");
         assert_eq!(bench.is_bootloader(NODE), reset == 3, "after {reset}");
+        if reset == 3 {
+            // 6000h: software; 2: a crash loop.
+            assert_eq!(bench.emergencies(from)[0], [0x00, 0x60, 0x01, 2, 0, 0, 0, 0]);
+        }
     }
-    power_cycle(&mut bench);
+    bench.restart();
     assert!(bench.is_bootloader(NODE), "a power-on alone does not try it again");
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    bench.start_program();
     assert!(!bench.is_bootloader(NODE), "a request does");
     // NMT reset node is a request, and does not count as a crash.
     for _ in 0..5 {
@@ -302,10 +295,8 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
         (program - window).0 / 1_000_000_000
     );
     assert!(!bench.is_bootloader(NODE));
-    let told: Vec<_> =
-        bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x80 + u32::from(NODE)).collect();
     // 8: the rescue window.
-    assert_eq!(told[0].2, [0x00, 0xFF, 0x00, b'B', b'O', b'O', b'T', 8]);
+    assert_eq!(bench.emergencies(from)[0], [0x00, 0xFF, 0x00, b'B', b'O', b'O', b'T', 8]);
 
     // Network management concerns all nodes, and keeps no device in the bootloader.
     bench.power_off();
@@ -346,19 +337,12 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
 #[test]
 fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
     let magic = u32::from_le_bytes(*b"CBW1");
-    let check = |words: [u32; 3]| {
-        // The fold of the ABI, implemented again: rotate by 5, exclusive or, multiply; inverted at
-        // the end.
-        !words
-            .iter()
-            .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1))
-    };
-    let sound = |words: [u32; 3]| [words[0], words[1], words[2], check(words)];
+    let sound = |words: [u32; 3]| [words[0], words[1], words[2], check_word(&words)];
     let older = u32::from_le_bytes(*b"CBW0");
     for (what, cell, stays) in [
         ("noise", [0x1234_5678, 0x9ABC_DEF0, 0x0F1E_2D3C, 0x4B5A_6978], false),
         ("an older version", sound([older, 1, 0]), false),
-        ("a wrong check word", [magic, 1, 0, check([magic, 1, 0]) ^ 1], false),
+        ("a wrong check word", [magic, 1, 0, check_word(&[magic, 1, 0]) ^ 1], false),
         ("an unknown request", sound([magic, 99, 0]), false),
         ("an impossible argument", sound([magic, 3, 255]), false),
         ("stay, for comparison", sound([magic, 1, 0]), true),
@@ -366,8 +350,7 @@ fn a_cell_that_asks_for_what_is_not_there_does_no_harm() {
         ("a trial of one", sound([magic, 2, 200]), true),
     ] {
         let mut bench = running_board();
-        let bytes: Vec<u8> = cell.iter().flat_map(|word| word.to_le_bytes()).collect();
-        bench.machine().write_ram(firmware::board().warm_start.base, &bytes).unwrap();
+        bench.set_warm_start(cell);
         bench.machine().reset_pin();
         bench.await_boot_up(1000);
         assert_eq!(bench.is_bootloader(NODE), stays, "{what}");

@@ -6,7 +6,7 @@ use canopen::program::{
     PROGRAM_VERSION, STATE_BOOTLOADER, STATE_PROGRAM_START, STATE_RENEWAL,
 };
 use canopen::Address;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{
     cells, confirm, crc_of, identification, image_of, number, progress, running, stage, start, status,
@@ -62,8 +62,7 @@ fn board_on(options: Options) -> Bench {
 }
 
 fn call_back(bench: &mut Bench) {
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
     bench.events();
 }
@@ -81,8 +80,7 @@ fn power_cycle(bench: &mut Bench) {
 #[test]
 fn a_new_bootloader_is_installed_while_the_program_stays() {
     let mut bench = board();
-    let at = Address::new(DEVICE_STATE, STATE_BOOTLOADER);
-    assert_eq!(bench.session().read_number(at).unwrap(), u32::from(number()));
+    assert_eq!(bench.number(DEVICE_STATE, STATE_BOOTLOADER), u32::from(number()));
     let old = image_of(firmware::BOOTLOADER);
     assert_eq!((progress(&mut bench), identification(&mut bench)), (Progress::default(), crc_of(&old)));
     let program = Region::new(firmware::board().programs[0].base, 32 * 1024);
@@ -102,10 +100,9 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     let from = bench.time();
     confirm(&mut bench);
     // Each answer while home is erased and written.
-    let frames = bench.frames_since(from);
-    let asked = frames.iter().filter(|(_, id, _)| *id == 0x600 + u32::from(NODE));
-    let answers = frames.iter().filter(|(_, id, _)| *id == 0x580 + u32::from(NODE));
-    let slowest = asked.zip(answers).map(|((asked, ..), (answered, ..))| *answered - *asked).max().unwrap();
+    let asked = bench.frames_of(REQUEST.into(), from).into_iter();
+    let answers = bench.frames_of(RESPONSE, from);
+    let slowest = asked.zip(answers).map(|((asked, _), (answered, _))| answered - asked).max().unwrap();
     assert!(slowest <= Span::from_millis(5), "{slowest:?}");
     assert_eq!(cells(&mut bench, home(new.len())), new);
 
@@ -188,7 +185,7 @@ fn the_image_may_differ_in_every_address() {
     let mut bench = board();
     let other = image_of(firmware::BOOTLOADER_WATCHDOG);
     let watchdog = |bench: &mut Bench| {
-        let word = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)).unwrap();
+        let word = bench.number(DEVICE_STATE, STATE_PROGRAM_START);
         ProgramStart::of_word(word).watchdog_ms
     };
     assert_eq!(watchdog(&mut bench), 0);
@@ -212,7 +209,7 @@ fn a_short_dip_of_the_supply_in_a_trial_is_a_power_on() {
     bench.run_ms(1);
     bench.machine().set_supply(3_300, Span(0));
     bench.run_ms(500);
-    let resets: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    let resets = bench.stops();
     assert!(resets.contains(&Stop::Reset(emulator::machine::ResetCause::PowerOn)), "{resets:?}");
     assert!(!bench.is_bootloader(NODE), "the program starts");
 }
@@ -286,7 +283,7 @@ fn an_image_that_does_not_work_ends_by_itself() {
         let over = Progress { state: State::Staged, origin: Origin::Home, trial_end: end };
         assert_eq!((progress(&mut bench), identification(&mut bench)), (over, old), "{case}");
         assert!(bench.is_bootloader(NODE), "{case}");
-        let crashes = bench.session().read_number(Address::new(DEVICE_STATE, 4)).unwrap();
+        let crashes = bench.number(DEVICE_STATE, 4);
         assert_eq!(crashes, 0, "{case}: no program has crashed");
         power_cycle(&mut bench);
         assert!(!bench.is_bootloader(NODE), "{case}: the program starts");
@@ -317,15 +314,13 @@ fn a_trial_that_nobody_confirms_ends() {
     // A fault in it.
     start(&mut bench);
     bench.run_ms(20);
-    let idle = bench.machine().pc();
-    bench.machine().write_ram(idle, &FAULTS[0].to_le_bytes()).expect("idle sleeps in RAM");
+    bench.replace_idle(FAULTS[0]);
     bench.await_boot_up(3_000);
     assert_eq!(progress(&mut bench), over(TrialEnd::Reset(ResetCause::Software)));
     // It stops to feed the watchdog.
     start(&mut bench);
     bench.run_ms(20);
-    let idle = bench.machine().pc();
-    bench.machine().write_ram(idle, &HANGS[0].to_le_bytes()).expect("idle sleeps in RAM");
+    bench.replace_idle(HANGS[0]);
     bench.await_boot_up(5_000);
     assert_eq!(progress(&mut bench), over(TrialEnd::Reset(ResetCause::IndependentWatchdog)));
     // A master gives it up.

@@ -86,9 +86,7 @@ fn the_bit_rate_is_found_and_nobody_is_disturbed_with_every_chip() {
         bench.post(LSS, &CONFIGURATION);
         lss(&mut bench, [0x13, 0, 9, 0, 0, 0, 0, 0]);
         lss(&mut bench, [0x17, 0, 0, 0, 0, 0, 0, 0]);
-        bench.power_off();
-        bench.run_ms(10);
-        bench.power_on();
+        bench.power_cycle();
         bench.set_host_bit_rate(500_000);
         bench.world.add_host_port(500_000);
         let from = bench.time();
@@ -169,9 +167,7 @@ fn an_application_with_the_data_cache_on_does_not_lose_a_value_to_a_worn_cell() 
         let answers = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x7E4);
         let answers: Vec<_> = answers.map(|(_, _, data)| data).collect();
         assert_eq!(answers, [[0x17, 0, 0, 0, 0, 0, 0, 0]], "node {next}");
-        bench.power_off();
-        bench.run_ms(10);
-        bench.power_on();
+        bench.power_cycle();
         bench.await_boot_up_of(next, 1_000);
         bench.run_ms(50);
         assert!(!bench.is_bootloader(next), "node {next} after {node}");

@@ -1,8 +1,6 @@
 //! 1F52h (CiA 302-3, verify application software): date and time of the program, in the bootloader, in the
 //! application template and in the application in C.
 
-use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::file::convert::{program_of, Label, Options};
@@ -25,8 +23,8 @@ fn dated(image: &str, date: u64) -> Program {
 }
 
 fn date(bench: &mut Bench) -> [u32; 2] {
-    assert_eq!(bench.session().read_number(Address::new(0x1F52, 0)).unwrap(), 2);
-    [1, 2].map(|sub| bench.session().read_number(Address::new(0x1F52, sub)).unwrap())
+    assert_eq!(bench.number(0x1F52, 0), 2);
+    [1, 2].map(|sub| bench.number(0x1F52, sub))
 }
 
 #[test]
@@ -44,14 +42,11 @@ fn every_program_and_its_bootloader_have_the_date_of_the_program() {
         flash(&mut bench.session(), &file, &FlashOptions::default().force(true), &mut |_| {}).unwrap();
         assert!(!bench.is_bootloader(NODE));
         assert_eq!(date(&mut bench), expected, "{image} runs");
-        bench.power_off();
-        bench.run_ms(10);
-        bench.power_on();
+        bench.power_cycle();
         bench.run_ms(500);
         assert!(!bench.is_bootloader(NODE));
         assert_eq!(date(&mut bench), expected, "{image} runs after a power cut");
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
+        bench.call_back();
         assert_eq!(date(&mut bench), expected, "{image} is installed");
     }
     bench.assert_nothing_unmodelled();

@@ -1,11 +1,12 @@
 //! How much of the stack the bootloader uses: its boot stage, and its RAM image.
 
+use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, stack};
 use emulator::time::Span;
 use shared_abi::geometry::Region;
 use shared_abi::layout::LEAST_STACK;
 
-use crate::device::{call_back, empty_board, install, running_board};
+use crate::device::running_board;
 
 /// The boot stage, from power-on to the first instruction of a program and to that of the RAM image,
 /// uses no more than is kept free for it: the end of the RAM, where the image is not copied to.
@@ -14,7 +15,7 @@ fn the_boot_stage_stays_within_its_stack() {
     let board = firmware::board();
     let mut depths = Vec::new();
     for is_installed in [true, false] {
-        let mut bench = if is_installed { running_board() } else { empty_board() };
+        let mut bench = if is_installed { running_board() } else { Bench::new().switched_on() };
         if is_installed {
             bench.confirm_program();
         }
@@ -37,10 +38,10 @@ fn the_boot_stage_stays_within_its_stack() {
 #[test]
 fn an_update_stays_within_the_stack() {
     let mut bench = running_board();
-    call_back(&mut bench);
+    bench.call_back();
     let stack = stack::of_image(firmware::BOOTLOADER);
     stack::fill(bench.machine(), stack);
-    install(&mut bench, firmware::APP_V2);
+    bench.update(firmware::APP_V2);
     let depth = stack::depth(bench.machine(), stack);
     println!("the stack has {} bytes, of which {depth} are used", stack.size);
     assert!((200..=LEAST_STACK).contains(&depth), "{depth} bytes");

@@ -1,6 +1,5 @@
 //! A program that puts the chip into Standby: the device starts it again when it wakes up.
 
-use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::update::{flash, FlashOptions};
@@ -63,7 +62,7 @@ fn a_device_that_wakes_up_starts_its_program_each_time() {
                 bench.run_ms(100);
                 bench.machine().wake_up();
                 bench.await_boot_up(100);
-                let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+                let stops = bench.stops();
                 assert_eq!(stops, [Stop::Reset(ResetCause::Standby)], "{what}, wake-up {wake}");
                 assert!(!bench.is_bootloader(NODE), "{what}, wake-up {wake}");
             }
@@ -87,12 +86,11 @@ fn a_watchdog_that_ends_standby_is_no_crash() {
         bench.machine().preset_watchdog(0x400);
         enter_standby(&mut bench);
         bench.await_boot_up(1000);
-        let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        let stops = bench.stops();
         assert_eq!(stops, [Stop::Reset(ResetCause::IndependentWatchdog)], "wake-up {wake}");
         assert!(!bench.is_bootloader(NODE), "wake-up {wake}");
     }
     // And it can be called back.
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
 }

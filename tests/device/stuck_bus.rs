@@ -3,7 +3,6 @@
 
 use std::time::Duration;
 
-use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::update::{flash, FlashOptions};
@@ -55,8 +54,7 @@ fn an_update_on_a_line_that_falls_breaks_off_and_works_later() {
         let what = format!("after {after_ms} ms, {silicon}");
         let mut bench = board(silicon).switched_on();
         assert!(update(&mut bench, firmware::APP_V1), "{what}");
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1_000);
+        bench.call_back();
         bench.run_ms(20);
         bench.events();
         bench.world.hold_dominant_after(Span::from_millis(after_ms));
@@ -86,8 +84,7 @@ fn a_program_on_a_dominant_line_can_be_called_back_later() {
         bench.run_ms(2 * MINUTE_MS);
         comes_back(&mut bench, &what);
         assert!(!bench.is_bootloader(NODE), "{what}");
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1_000);
+        bench.call_back();
         assert!(bench.is_bootloader(NODE), "{what}");
     }
 }

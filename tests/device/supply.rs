@@ -22,8 +22,7 @@ const LOW: u32 = 2_500;
 fn board_with_a_program() -> Bench {
     let mut bench = Bench::new().switched_on();
     update(&mut bench, firmware::APP_V1).unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     bench.run_ms(20);
     bench.events();
     bench
@@ -132,7 +131,7 @@ fn a_device_that_its_supply_resets_in_the_middle_of_an_update_is_reachable() {
             bench.events();
             set_supply(&mut bench, 3_300);
             bench.await_boot_up(1_000);
-            let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+            let stops = bench.stops();
             assert_eq!(stops.first(), Some(&Stop::Reset(cause)), "{what}");
             bench.run_ms(400);
             update(&mut bench, firmware::APP_V2).unwrap();
@@ -163,8 +162,7 @@ fn a_program_gets_the_voltage_detector_switched_off() {
     let level = bsp::voltage::detector_level(bsp::SUPPLY_MV);
     let watches = bench.machine().register(PWR_CR).unwrap() >> 4 & 0xF;
     assert_eq!(watches, level.map_or(0, |level| u32::from(level) << 1 | 1));
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    bench.start_program();
     assert_eq!(bench.machine().register(PWR_CR).unwrap() >> 4 & 0xF, 0);
     bench.assert_nothing_unmodelled();
 }
@@ -190,8 +188,7 @@ fn with_every_combination_of_option_bytes_a_program_is_called_back_and_erased() 
         bench.power_on();
         bench.await_program(1_000);
         bench.run_ms(50);
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1_000);
+        bench.call_back();
         bench.run_ms(20);
         bench.session().command(1, ProgramControl::Clear).unwrap();
         bench.session().await_idle(1, Doing::Block(0)).unwrap();
@@ -230,10 +227,10 @@ fn every_combination_of_option_bytes_is_shown() {
             continue;
         }
         bench.await_boot_up(1000);
-        let told = bench.session().read_number(OPTION_BYTES).unwrap();
+        let option_bytes = bench.session().read_number(OPTION_BYTES).unwrap();
         // OPTLOCK is set.
-        assert_eq!(told, optcr | 1, "{optcr:08X}h");
-        let warnings = OptionBytes(told).warnings();
+        assert_eq!(option_bytes, optcr | 1, "{optcr:08X}h");
+        let warnings = OptionBytes(option_bytes).warnings();
         let has = |word: &str| warnings.iter().any(|warning| warning.contains(word));
         assert_eq!(has("brown-out"), level == 3, "{optcr:08X}h");
         assert_eq!(has("BFB2"), bits >> 2 & 1 != 0, "{optcr:08X}h");
@@ -254,8 +251,7 @@ fn with_each_level_of_read_out_protection_a_program_is_replaced_and_called_back(
         for image in [firmware::APP_V1, firmware::APP_V2] {
             update(&mut bench, image).unwrap();
             assert!(!bench.is_bootloader(NODE));
-            bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-            bench.await_boot_up(1_000);
+            bench.call_back();
             bench.run_ms(20);
         }
         assert_eq!(bench.session().read_number(OPTION_BYTES).unwrap() >> 8 & 0xFF, u32::from(rdp));
@@ -274,17 +270,14 @@ fn with_bfb2_the_device_works_until_its_second_bank_begins_with_a_stack_pointer(
     bench.power_on();
     bench.await_boot_up(1_000);
     update(&mut bench, firmware::APP_V1).unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1_000);
+    bench.call_back();
     bench.run_ms(20);
-    let told = bench.session().read_number(OPTION_BYTES).unwrap();
-    assert!(OptionBytes(told).boots_from_bank_2());
+    let option_bytes = bench.session().read_number(OPTION_BYTES).unwrap();
+    assert!(OptionBytes(option_bytes).boots_from_bank_2());
     let Some(bank) = chip.second_bank else { return };
     let second = chip.sector(bank).unwrap().region.base;
     bench.machine().load_bin(second, &chip.sram.base.to_le_bytes()).unwrap();
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     let from = bench.time();
     bench.run_ms(3_000);
     assert_eq!(bench.frames_since(from), []);

@@ -1,8 +1,6 @@
 //! CAN over UART: the bootloader and the application use the board's serial port, with `coflash`
 //! and its adapter.
 
-use std::env;
-use std::process::Command;
 use std::time::Duration;
 
 use canopen::program::ProgramControl;
@@ -11,8 +9,8 @@ use coboot_can::slcan::Slcan;
 use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
+use coboot_tests::{firmware, tools};
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::block_file::emit;
 use coflash_core::update::{flash, FlashOptions};
@@ -39,7 +37,7 @@ fn ask(bench: &mut Bench, text: &[u8], ms: u64) -> String {
     said(bench)
 }
 
-fn adapter(bench: &mut Bench) -> Slcan<SerialLine<'_>> {
+fn adapter(bench: &mut Bench) -> Slcan<SerialLine<&mut Bench>> {
     Slcan::open(SerialLine::new(bench), "the board's line".into(), Some(125_000)).expect("it opens")
 }
 
@@ -53,8 +51,8 @@ fn session(adapter: &mut dyn Adapter) -> Session<'_> {
 #[test]
 fn the_text_on_the_line() {
     let mut bench = empty_board();
-    let told = said(&mut bench);
-    assert_eq!(told, "t701100\rt081800FF00424F4F5406\r");
+    let sent = said(&mut bench);
+    assert_eq!(sent, "t701100\rt081800FF00424F4F5406\r");
     assert_eq!(ask(&mut bench, b"C\rS4\rO\r", 20), "\r\r\r");
     assert_eq!(ask(&mut bench, b"t60184000100000000000\r", 20), "z\rt58184300100000000010\r");
     // A data length code above 8, as on a bus (ISO 11898-1:2015, table 5).
@@ -121,16 +119,16 @@ fn noise_on_the_line_costs_nothing_but_itself() {
     .take(40_000)
     .collect();
     // 40 000 characters take 3.5 s.
-    let told = ask(&mut bench, &noise, 3600);
-    assert!(told.matches('\x07').count() > 100, "{} refusals", told.matches('\x07').count());
-    assert!((3..=4).contains(&told.matches("t70117F\r").count()), "{told:?}");
+    let sent = ask(&mut bench, &noise, 3600);
+    assert!(sent.matches('\x07').count() > 100, "{} refusals", sent.matches('\x07').count());
+    assert!((3..=4).contains(&sent.matches("t70117F\r").count()), "{sent:?}");
     ask(&mut bench, b"\r", 10);
     assert!(is_answered(&mut bench));
     // A host requests twice as many answers as the line can carry. The device's own frames are
     // still sent.
     let flood = b"V\r".repeat(15_000);
-    let told = ask(&mut bench, &flood, 2700);
-    assert!((2..=3).contains(&told.matches("t70117F\r").count()), "heartbeats in a flood");
+    let sent = ask(&mut bench, &flood, 2700);
+    assert!((2..=3).contains(&sent.matches("t70117F\r").count()), "heartbeats in a flood");
     bench.run_ms(100);
     assert!(is_answered(&mut bench));
     // After half a line, the host starts a new one.
@@ -150,9 +148,9 @@ fn another_bit_rate_is_noticed() {
     let mut bench = empty_board();
     said(&mut bench);
     bench.usart().set_outside_bit_rate(38_400);
-    let told = ask(&mut bench, b"t60182F511F018000000000\rt60182F511F018000000000\r", 50);
-    assert!(told.contains("t08181081110000200000\r"), "{told:?}");
-    assert!(!told.contains("t5818"), "{told:?}");
+    let sent = ask(&mut bench, b"t60182F511F018000000000\rt60182F511F018000000000\r", 50);
+    assert!(sent.contains("t08181081110000200000\r"), "{sent:?}");
+    assert!(!sent.contains("t5818"), "{sent:?}");
     bench.usart().set_outside_bit_rate(115_200);
     ask(&mut bench, b"\r", 10);
     assert!(ask(&mut bench, b"F\r", 10).contains("F08\r"));
@@ -186,15 +184,10 @@ fn never_silent_during_an_erase() {
 #[cfg(unix)]
 #[test]
 fn the_coflash_command_finds_the_device_at_its_serial_port() {
-    let coflash = env::var_os("COBOOT_COFLASH")
-        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
     let mut endpoint = Endpoint::serial(empty_board());
     let url = endpoint.url();
-    let output = endpoint.run(Command::new(coflash).args(["--bus", &url, "info"]));
-    let told =
-        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{told}");
-    assert!(told.contains("the bootloader") && told.contains(bsp::IDENTITY.device_name), "{told}");
+    let sent = endpoint.succeed(tools::coflash().args(["--bus", &url, "info"]));
+    assert!(sent.contains("the bootloader") && sent.contains(bsp::IDENTITY.device_name), "{sent}");
 }
 
 /// python-can's adapter and python-canopen, both without knowledge of the device's own adapter,
@@ -202,18 +195,12 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
 #[cfg(unix)]
 #[test]
 fn python_canopen_flashes_the_device_through_its_serial_port() {
-    let python = env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
     let folder = kit::folder!("virtual-can");
     let file = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_VIRTUAL_CAN)));
     let mut endpoint = Endpoint::serial(empty_board());
     let port = endpoint.url().replace("@125k", "");
-    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/python/canopen_client.py");
-    let output = endpoint.run(Command::new(python).arg(script).arg(port).arg(file));
-    let told =
-        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{told}");
-    assert!(told.contains("the application reports 1F51h = 01h and the same 1F56h"), "{told}");
+    let sent = endpoint.succeed(tools::script("canopen_client.py").arg(port).arg(file));
+    assert!(sent.contains("the application reports 1F51h = 01h and the same 1F56h"), "{sent}");
     assert!(endpoint.bench.records().is_empty(), "something was on the CAN bus");
     endpoint.bench.assert_nothing_unmodelled();
 }

@@ -8,27 +8,13 @@ use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
-use emulator::time::{Span, Time};
-use object::{Object, ObjectSymbol};
-
-/// The emergencies since a time.
-fn emergencies(bench: &Bench, since: Time) -> Vec<Vec<u8>> {
-    let id = 0x80 + u32::from(NODE);
-    bench.frames_since(since).into_iter().filter(|frame| frame.1 == id).map(|frame| frame.2).collect()
-}
-
-/// The address of a function of the bootloader.
-fn address_of(part: &str) -> u32 {
-    let file = firmware::elf(firmware::BOOTLOADER);
-    let elf = object::File::parse(&file[..]).expect("an ELF of ours");
-    let symbol = elf.symbols().find(|symbol| symbol.name().is_ok_and(|name| name.contains(part)));
-    symbol.unwrap_or_else(|| panic!("no symbol {part}")).address() as u32 & !1
-}
+use emulator::time::Span;
 
 /// Overwrites the start of a function in RAM with Thumb code.
 fn patch(bench: &mut Bench, function: &str, code: &[u16]) {
     let bytes: Vec<u8> = code.iter().flat_map(|half| half.to_le_bytes()).collect();
-    bench.machine().write_ram(address_of(function), &bytes).expect("it lies in RAM");
+    let address = firmware::symbol(firmware::BOOTLOADER, |name| name.contains(function));
+    bench.machine().write_ram(address, &bytes).expect("it lies in RAM");
 }
 
 fn running_bootloader() -> Bench {
@@ -46,8 +32,7 @@ fn bootloader_with_a_program(bench: &mut Bench) {
     // This program does not feed a watchdog: it would not live through the watch of the tool.
     let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     bench.run_ms(20);
     bench.events();
 }
@@ -68,15 +53,14 @@ fn a_task_that_hangs_ends_in_a_watchdog_reset_and_the_device_is_back() {
     // The time is for the LSI's nominal frequency; before, the watchdog is fed every 2 ms.
     let ms = (at - hung).0 / 1_000_000_000;
     assert!((900..=1010).contains(&ms), "reset after {ms} ms");
-    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
+    assert!(bench.is_bootloader(NODE));
 }
 
 #[test]
 fn a_task_that_is_alive_does_not_feed_for_one_that_is_not() {
     let mut bench = running_bootloader();
     // `idle` hangs; protocol and tick continue, and so does the heartbeat until the reset.
-    let idle = bench.machine().pc();
-    bench.machine().write_ram(idle, &HANG[0].to_le_bytes()).expect("idle sleeps in RAM");
+    bench.replace_idle(HANG[0]);
     bench.run_ms(1500);
     let events = bench.events();
     assert!(matches!(events[..], [(_, Stop::Reset(ResetCause::IndependentWatchdog))]), "{events:?}");
@@ -93,32 +77,12 @@ fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
     let events = bench.events();
     assert!(matches!(events[..], [(_, Stop::Reset(ResetCause::Software))]), "{events:?}");
     // 6000h: software; 7: a fault of the bootloader. Then "BOOT" and the same reason.
-    let told = emergencies(&bench, from);
-    assert_eq!(told, [[0x00, 0x60, 0x01, 7, 0, 0, 0, 0], [0x00, 0xFF, 0x01, b'B', b'O', b'O', b'T', 7]]);
-    assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
-}
-
-#[test]
-fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
-    let mut bench = Bench::new().switched_on();
-    bench.install(firmware::APP_V1);
-    bench.confirm_program();
-    for crash in 1..=3 {
-        bench.events();
-        // An application that started the watchdog and then hangs: LSI / 4, 8 ms.
-        let from = bench.time();
-        bench.machine().preset_watchdog(64);
-        bench.run_ms(200);
-        let events = bench.events();
-        assert!(matches!(events[..], [(_, Stop::Reset(ResetCause::IndependentWatchdog))]), "{events:?}");
-        let is_bootloader = bench.session().device_type().unwrap().unwrap().is_bootloader();
-        assert_eq!(is_bootloader, crash == 3, "after crash {crash}");
-        if crash == 3 {
-            // 2: a crash loop.
-            let told = emergencies(&bench, from);
-            assert_eq!(told[0], [0x00, 0x60, 0x01, 2, 0, 0, 0, 0]);
-        }
-    }
+    let emergencies = bench.emergencies(from);
+    assert_eq!(
+        emergencies,
+        [[0x00, 0x60, 0x01, 7, 0, 0, 0, 0], [0x00, 0xFF, 0x01, b'B', b'O', b'O', b'T', 7]]
+    );
+    assert!(bench.is_bootloader(NODE));
 }
 
 const IWDG_PR: u32 = 0x4000_3004;
@@ -175,8 +139,7 @@ fn a_program_that_never_feeds_its_watchdog_is_ended_after_a_second_of_the_lsi() 
         let mut bench = Bench::of_image_with(firmware::BOOTLOADER_WATCHDOG, options);
         bench.machine().set_hardware_watchdog(has_watchdog);
         bootloader_with_a_program(&mut bench);
-        bench.session().command(1, ProgramControl::Start).unwrap();
-        bench.await_boot_up(1000);
+        bench.start_program();
         // RM0090 section 21.4.2: LSI / 64, 2 ms a count.
         let values = [IWDG_PR, IWDG_RLR].map(|address| register(&mut bench, address));
         assert_eq!(values, [4, 500], "{lsi_hz} Hz, {has_watchdog}");
@@ -211,11 +174,10 @@ fn a_watchdog_does_not_survive_a_jump_into_the_bootloader() {
     bench.events();
     // LSI / 4, 100 ms: longer than the way back, and shorter than the bootloader stays.
     bench.machine().preset_watchdog(800);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
     bench.run_ms(2000);
-    let events: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    let events = bench.stops();
     assert_eq!(events, [Stop::Reset(ResetCause::Software)]);
     assert!(bench.is_bootloader(NODE));
 }

@@ -1,7 +1,7 @@
 //! Ways into a bootloader without an entry strap, in a product that has them: two resets by the NRST pin, and
 //! the loader in the chip's ROM.
 
-use canopen::program::{ProgramControl, DEVICE_STATE, STATE_CRASH_RESETS, STATE_REASON};
+use canopen::program::{DEVICE_STATE, STATE_CRASH_RESETS, STATE_REASON};
 use canopen::{AbortCode, Address};
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
@@ -40,12 +40,12 @@ fn two_resets_by_the_pin_within_half_a_second_keep_the_device_in_the_bootloader(
     reset(&mut bench);
     let started = bench.await_boot_up(1000);
     bench.run_ms(1);
-    let told = bench.frames_since(from);
+    let frames = bench.frames_since(from);
     assert!(!bench.is_bootloader(NODE));
     let ms = (started - from).0 / 1_000_000_000;
     println!("two_resets: the program's boot-up {ms} ms after a reset by the pin");
     assert!((500..=525).contains(&ms), "{ms} ms");
-    assert_eq!(told.len(), 1, "the boot stage is silent: {told:x?}");
+    assert_eq!(frames.len(), 1, "the boot stage is silent: {frames:x?}");
 
     for between in [40, 250, 480] {
         reset(&mut bench);
@@ -100,7 +100,7 @@ fn only_resets_by_the_pin_count() {
     bench.events();
     bench.machine().preset_watchdog(160);
     bench.await_boot_up(100);
-    let events: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    let events = bench.stops();
     assert_eq!(events, [Stop::Reset(ResetCause::IndependentWatchdog)]);
     assert!(!bench.is_bootloader(NODE), "the reset of a watchdog is no second one");
     reset(&mut bench);
@@ -208,13 +208,12 @@ fn the_rom_loader_finds_the_chip_as_after_a_reset() {
     let mut bench = running_board(firmware::BOOTLOADER_WAYS_IN);
     load_rom(&mut bench);
     assert_eq!(start_rom_loader(&mut bench), Err(AbortCode(0x0602_0000)), "a program has no such object");
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(100);
+    bench.call_back();
     bench.run_ms(20);
     bench.events();
     assert_eq!(start_rom_loader(&mut bench), Ok(()));
     bench.run_ms(100);
-    let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    let stops = bench.stops();
     assert_eq!(stops, [Stop::Reset(ResetCause::Software)]);
     assert!(rom_runs(&mut bench));
     let core = bench.machine().core_registers();
@@ -260,8 +259,7 @@ fn the_rom_loader_is_not_started_beside_a_watchdog_or_by_another_reset() {
     bench.run_ms(600);
     assert!(!bench.is_bootloader(NODE), "the program runs");
     bench.machine().set_hardware_watchdog(true);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(100);
+    bench.call_back();
     bench.run_ms(20);
     assert_eq!(start_rom_loader(&mut bench), Err(AbortCode(0x0800_0022)));
     bench.machine().set_hardware_watchdog(false);
@@ -270,22 +268,15 @@ fn the_rom_loader_is_not_started_beside_a_watchdog_or_by_another_reset() {
 
 /// A product without the choices.
 #[test]
-fn without_the_choice_there_is_no_such_object() {
-    let mut bench = Bench::new();
-    load_rom(&mut bench);
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench.run_ms(20);
-    assert_eq!(start_rom_loader(&mut bench), Err(AbortCode(0x0602_0000)));
-}
-
-/// The same.
-#[test]
-fn without_the_choice_two_resets_are_two_starts() {
+fn without_the_choices_there_is_no_such_object_and_two_resets_are_two_starts() {
     let mut bench = running_board(firmware::BOOTLOADER);
     for _ in 0..3 {
         reset(&mut bench);
         bench.run_ms(100);
     }
     assert!(!bench.is_bootloader(NODE));
+    load_rom(&mut bench);
+    bench.call_back();
+    bench.run_ms(20);
+    assert_eq!(start_rom_loader(&mut bench), Err(AbortCode(0x0602_0000)));
 }

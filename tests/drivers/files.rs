@@ -76,18 +76,18 @@ impl Files {
 impl Flash for Files {
     fn read(&self, address: u32, buffer: &mut [u8]) {
         let mut at = address;
-        let mut rest = buffer;
-        while !rest.is_empty() {
+        let mut remaining = buffer;
+        while !remaining.is_empty() {
             let sector = self.sector_at(at);
             let left = sector.map_or(1, |sector| sector.region.end() - at);
-            let (part, after) = rest.split_at_mut(rest.len().min(left as usize));
+            let (part, after) = remaining.split_at_mut(remaining.len().min(left as usize));
             let read = sector.map(|sector| self.read_sector(sector, at - sector.region.base, part));
             if !matches!(read, Some(Ok(()))) {
                 // Erased, outside, or unreadable: the CRC of what was there is wrong then.
                 part.fill(u8::MAX);
             }
             at = at.wrapping_add(part.len() as u32);
-            rest = after;
+            remaining = after;
         }
     }
 

@@ -2,13 +2,10 @@
 //! that uses a protocol switch threshold, like CANopenNode, and by python-canopen, which uses none.
 //! Frames from CiA 301 section 7.2.4.3.13 ff.
 
-use std::path::Path;
-use std::process::Command;
-
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::firmware;
+use coboot_tests::{firmware, tools};
 
 fn bootloader() -> Bench {
     let mut bench = Bench::new().switched_on();
@@ -76,17 +73,10 @@ fn small_objects_come_as_an_ordinary_upload_where_the_client_has_a_threshold() {
 /// python-canopen, unmodified.
 #[test]
 fn python_canopen_reads_objects_by_block_upload() {
-    let python = std::env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/block_upload_client.py");
     for bench in [bootloader(), application()] {
         let mut endpoint = Endpoint::new(bench);
-        let mut command = Command::new(&python);
-        command.arg(&script).arg(endpoint.address()).arg(NODE.to_string());
-        let output = endpoint.run(&mut command);
-        let said =
-            format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-        assert!(output.status.success(), "{said}");
+        let mut client = tools::script("block_upload_client.py");
+        let said = endpoint.succeed(client.arg(endpoint.address()).arg(NODE.to_string()));
         let name: String = bsp::IDENTITY.device_name.bytes().map(|byte| format!("{byte:02x}")).collect();
         assert!(said.contains(&format!("1008h/0: {name}\n")), "{said}");
         endpoint.bench.assert_nothing_unmodelled();

@@ -1,36 +1,18 @@
 //! Foreign programs, unmodified, and our own command line: against the emulated device through the
 //! socketcand endpoint.
 
-use std::env;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
-
-use canopen::{Address, BitRate};
+use canopen::BitRate;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
+use coboot_tests::tools::{coflash, script, text};
 use coflash_core::file::block_file::emit;
 
-const VERSION: Address = Address::new(0x100A, 0);
+const VERSION: u16 = 0x100A;
 
 fn endpoint() -> Endpoint {
     let bench = Bench::new().switched_on();
     Endpoint::new(bench)
-}
-
-pub fn text(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
-
-/// The python of `cargo xtask test`, with the pinned third-party packages.
-pub fn python() -> Command {
-    let python = env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    Command::new(python)
-}
-
-pub fn script(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name)
 }
 
 #[test]
@@ -38,11 +20,7 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     let mut endpoint = endpoint();
     let folder = kit::folder!("clients");
     let file = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_V1)));
-    let mut python = python();
-    python.arg(script("canopen_client.py")).arg(endpoint.address()).arg(file);
-    let output = endpoint.run(&mut python);
-    let said = text(&output);
-    assert!(output.status.success(), "{said}");
+    let said = endpoint.succeed(script("canopen_client.py").arg(endpoint.address()).arg(file));
     let bsp::Identity { vendor_id, product_code, revision, .. } = bsp::IDENTITY;
     for line in [
         "1000h device type = 10000000h",
@@ -54,7 +32,7 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
     ] {
         assert!(said.contains(line), "no {line:?} in:\n{said}");
     }
-    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    assert_eq!(endpoint.bench.text(VERSION), "1.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }
 
@@ -64,26 +42,22 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
 fn python_canopen_updates_the_device_by_raw_images() {
     let folder = kit::folder!("clients");
     let mut endpoint = endpoint();
-    for (image, way, version) in
+    for (image, option, version) in
         [(firmware::APP_V1, None, "1.0.0"), (firmware::APP_V2, Some("--block"), "2.0.0")]
     {
         let path = folder.write(format!("{image}.bin"), firmware::raw(image));
-        let mut python = python();
-        python.arg(script("image_client.py")).arg(endpoint.address()).arg(path).args(way);
-        let output = endpoint.run(&mut python);
-        assert!(output.status.success(), "{}", text(&output));
-        assert!(text(&output).contains("started; 1F56h is the same"), "{}", text(&output));
-        assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
+        let mut client = script("image_client.py");
+        let said = endpoint.succeed(client.arg(endpoint.address()).arg(path).args(option));
+        assert!(said.contains("started; 1F56h is the same"), "{said}");
+        assert_eq!(endpoint.bench.text(VERSION), version);
     }
     // A machine that moves is left alone, and its program stays.
     endpoint.bench.move_machine(firmware::APP_V2, true);
     let path = folder.write("again.bin", firmware::raw(firmware::APP_V1));
-    let mut python = python();
-    python.arg(script("image_client.py")).arg(endpoint.address()).arg(path);
-    let output = endpoint.run(&mut python);
+    let output = endpoint.run(script("image_client.py").arg(endpoint.address()).arg(path));
     assert!(!output.status.success() && text(&output).contains("08000022"), "{}", text(&output));
     endpoint.bench.run_ms(700);
-    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(endpoint.bench.text(VERSION), "2.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }
 
@@ -95,14 +69,11 @@ fn canopen_asyncio_updates_the_device_by_raw_images() {
     let mut endpoint = endpoint();
     for (image, stopped, version) in [(firmware::APP_V1, false, "1.0.0"), (firmware::APP_V2, true, "2.0.0")] {
         let path = folder.write(format!("{image}.bin"), firmware::raw(image));
-        let mut python = python();
-        python.arg(script("asyncio_client.py")).arg(endpoint.address()).arg(path).arg("1");
-        let output = endpoint.run(&mut python);
-        let said = text(&output);
-        assert!(output.status.success(), "{said}");
+        let mut client = script("asyncio_client.py");
+        let said = endpoint.succeed(client.arg(endpoint.address()).arg(path).arg("1"));
         assert_eq!(said.contains("node 1: stopped"), stopped, "{said}");
         assert!(said.contains("node 1: started; 1F56h is the same"), "{said}");
-        assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
+        assert_eq!(endpoint.bench.text(VERSION), version);
     }
     endpoint.bench.assert_nothing_unmodelled();
 }
@@ -117,40 +88,27 @@ fn public_scripts_update_the_device_twice_in_a_row() {
         let mut endpoint = Endpoint::slower(Bench::running(BitRate::K500, firmware::APP_V1), SLOWER);
         for (image, version) in [(firmware::APP_V2, "2.0.0"), (firmware::APP_V1, "1.0.0")] {
             let path = folder.write(format!("{image}.bin"), firmware::raw(image));
-            let mut python = python();
-            python.arg(script("script_client.py")).arg(endpoint.address()).arg(path).arg(order);
-            let output = endpoint.run(python.args(["--slower", &SLOWER.to_string()]));
-            assert!(output.status.success(), "{order}: {}", text(&output));
-            assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version, "{order}");
+            let mut client = script("script_client.py");
+            client.arg(endpoint.address()).arg(path).arg(order).args(["--slower", &SLOWER.to_string()]);
+            println!("{order}: {}", endpoint.succeed(&mut client));
+            assert_eq!(endpoint.bench.text(VERSION), version, "{order}");
         }
         endpoint.bench.assert_nothing_unmodelled();
     }
-}
-
-/// The command line built by `cargo xtask test`.
-pub fn coflash() -> Command {
-    let coflash = env::var_os("COBOOT_COFLASH")
-        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
-    Command::new(coflash)
 }
 
 #[test]
 fn the_coflash_command_does_the_main_job_through_a_socket() {
     let mut endpoint = endpoint();
     let url = endpoint.url();
-    let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
-    assert!(output.status.success(), "{}", text(&output));
-    assert!(text(&output).contains("the bootloader"), "{}", text(&output));
-
-    let flash = |endpoint: &mut Endpoint, image: &str| {
-        let output = endpoint.run(coflash().args(["--bus", &url, "flash"]).arg(firmware::dir().join(image)));
-        assert!(output.status.success(), "{}", text(&output));
-    };
-    flash(&mut endpoint, firmware::APP_V1);
-    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
-    // An application runs now: it is called back.
-    flash(&mut endpoint, firmware::APP_V2);
-    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    let said = endpoint.succeed(coflash().args(["--bus", &url, "info"]));
+    assert!(said.contains("the bootloader"), "{said}");
+    // The second time an application runs: it is called back.
+    for (image, version) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
+        let file = firmware::dir().join(image);
+        println!("{}", endpoint.succeed(coflash().args(["--bus", &url, "flash"]).arg(file)));
+        assert_eq!(endpoint.bench.text(VERSION), version);
+    }
 }
 
 /// A file that cannot be flashed is refused before the device is changed.

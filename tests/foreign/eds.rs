@@ -1,39 +1,25 @@
 //! The EDS files against a foreign checker, importer and client, and against the device.
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
-use std::{env, fs};
+use std::fs;
+use std::path::Path;
+use std::process::Command;
 
 use canopen::program::{ESACADEMY_NODE_ID, LIFT_NODE_ID};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::eds::{self, Image};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
+use coboot_tests::tools::{given, script, text};
 use coflash_core::file::read::Firmware;
-use coflash_core::update::{flash, FlashOptions};
-
-fn images() -> Vec<Image> {
-    eds::images()
-}
 
 /// The board whose files are committed in `docs/eds/`.
 const COMMITTED_BOARD: &str = "stm32f407g-disc1";
 
-/// The python of `cargo xtask test`, with the pinned third-party packages.
-fn python() -> PathBuf {
-    env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"))
-        .into()
-}
-
-fn text(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
-
 /// dcfchk of dcf-tools: returns whether it finds no fault, and its output.
 fn dcfchk(eds: &Path) -> (bool, String) {
     // It is installed beside the interpreter, whose path may be a link and is not resolved.
-    let output = Command::new(python().with_file_name("dcfchk")).arg(eds).output().expect("dcfchk starts");
+    let dcfchk = given("COBOOT_PYTHON").with_file_name("dcfchk");
+    let output = Command::new(dcfchk).arg(eds).output().expect("dcfchk starts");
     (output.status.success(), text(&output))
 }
 
@@ -43,7 +29,7 @@ fn the_committed_files_are_what_the_tables_give() {
         println!("not compared: the committed files are those of {COMMITTED_BOARD}");
         return;
     }
-    let images = images();
+    let images = eds::images();
     for kept in
         fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/eds")).expect("it is committed")
     {
@@ -57,7 +43,7 @@ fn the_committed_files_are_what_the_tables_give() {
 #[test]
 fn dcfchk_finds_no_fault_in_the_files_and_one_in_each_damaged_copy() {
     let folder = kit::folder!("eds");
-    for image in images() {
+    for image in eds::images() {
         let (good, said) = dcfchk(&folder.write(&image.file, image.eds()));
         assert!(good && said.is_empty(), "{}: {said}", image.file);
     }
@@ -95,10 +81,8 @@ fn board() -> Bench {
 /// The board with version 1 of the application running.
 fn board_with_application() -> Bench {
     let mut bench = board();
-    let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {})
-        .expect("it takes the program");
-    assert_eq!(bench.session().device_type().unwrap().map(|running| running.is_bootloader()), Some(false));
+    bench.install(firmware::APP_V1);
+    assert!(!bench.is_bootloader(NODE));
     bench
 }
 
@@ -106,12 +90,9 @@ fn board_with_application() -> Bench {
 fn compare(image: &Image, bench: Bench, node: u8) {
     let folder = kit::folder!("eds");
     let mut endpoint = Endpoint::new(bench);
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/eds_client.py");
-    let mut client = Command::new(python());
-    client.arg(script).arg(endpoint.address()).arg(folder.write(&image.file, image.eds()));
-    let output = endpoint.run(client.args(["--node", &node.to_string()]));
-    let said = text(&output);
-    assert!(output.status.success(), "{}: {said}", image.file);
+    let mut client = script("eds_client.py");
+    client.arg(endpoint.address()).arg(folder.write(&image.file, image.eds()));
+    let said = endpoint.succeed(client.args(["--node", &node.to_string()]));
     let summary = format!("{} values compared, 0 differ", image.entries.len());
     assert!(said.contains(&summary), "{}: no {summary:?} in:\n{said}", image.file);
     endpoint.bench.assert_nothing_unmodelled();
@@ -142,14 +123,10 @@ fn python_canopen_finds_the_application_as_its_file_says() {
     compare(&eds::application(), board_with_application(), NODE);
 }
 
-/// The other direction: the device has only objects that the file names.
-fn survey(image: &Image, bench: Bench) {
-    survey_of(image, bench, NODE);
-}
-
-/// All objects and sub-indices that a client can find on this node: standard ones and the manufacturer's, and
-/// those of the profiles that a bootloader has (6005h of CiA 814-1, 7F50h of ESAcademy).
-fn survey_of(image: &Image, mut bench: Bench, node: u8) {
+/// The other direction: the device has only objects that the file names. All objects and sub-indices that a client
+/// can find on this node: standard ones and the manufacturer's, and those of the profiles that a bootloader has (6005h
+/// of CiA 814-1, 7F50h of ESAcademy).
+fn survey(image: &Image, mut bench: Bench, node: u8) {
     let mut abort_of = |index: u16, sub: u8| {
         let [low, high] = index.to_le_bytes();
         let (request, response) = (0x600 + u16::from(node), 0x580 + u32::from(node));
@@ -217,7 +194,7 @@ fn each_product_has_the_objects_of_its_file_and_no_others() {
     ] {
         let image = eds::bootloader_of(product, sealed).expect("a product of the repository");
         let (bench, node) = board_with(name);
-        survey_of(&image, bench, node);
+        survey(&image, bench, node);
         println!("{}: {} objects and sub-indices", image.file, image.entries.len());
     }
 }
@@ -254,12 +231,12 @@ fn a_file_has_no_object_that_the_product_leaves_out() {
 
 #[test]
 fn the_bootloader_has_no_object_that_its_file_does_not_name() {
-    survey(&eds::default_bootloader(), board());
+    survey(&eds::default_bootloader(), board(), NODE);
 }
 
 #[test]
 fn the_application_has_no_object_that_its_file_does_not_name() {
-    survey(&eds::application(), board_with_application());
+    survey(&eds::application(), board_with_application(), NODE);
 }
 
 /// A new object is documented on the page for it.
@@ -267,7 +244,7 @@ fn the_application_has_no_object_that_its_file_does_not_name() {
 fn the_protocol_page_names_every_object() {
     let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/protocol.md");
     let page = fs::read_to_string(page).expect("docs/protocol.md is committed");
-    for image in images() {
+    for image in eds::images() {
         for index in image.indices() {
             assert!(
                 page.contains(&format!("\n| {index:04X}h")),

@@ -2,20 +2,17 @@
 //! the bootloader, return to it and are updated. And the messages for authors who make a mistake.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::{env, fs};
 
-use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
+use coboot_tests::tools::{coflash, succeeded, text};
 use coboot_tests::{call_back, dead_crystal, firmware};
 use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two, Image};
-
-const CRC: Address = Address::new(0x1F56, 1);
 
 /// Each program as version 1, and as version 2, which another compiler may have built.
 const EXAMPLES: [[&str; 2]; 5] = [
@@ -34,21 +31,6 @@ const OF_EMBASSY: [u32; 2] = [0x4002_388C, 0x4000_6400];
 /// Whether the tests run for the board of the examples.
 fn is_board_of_examples() -> bool {
     firmware::board() == &stm32f407g_disc1::LAYOUT
-}
-
-/// A board with only the bootloader.
-fn empty_board() -> Bench {
-    Bench::new().switched_on()
-}
-
-fn coflash() -> Command {
-    let coflash = env::var_os("COBOOT_COFLASH")
-        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
-    Command::new(coflash)
-}
-
-fn text(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
 /// The label of an image, which must be complete and at its place.
@@ -78,7 +60,7 @@ fn a_project_of_the_template_is_installed_and_updates_itself() {
 }
 
 fn install_and_update(versions: [&str; 2]) {
-    let mut endpoint = Endpoint::new(empty_board());
+    let mut endpoint = Endpoint::new(Bench::new().switched_on());
     let url = endpoint.url();
     let mut crcs = Vec::new();
     for (version, name) in (1..).zip(versions) {
@@ -87,28 +69,22 @@ fn install_and_update(versions: [&str; 2]) {
         let mut command = coflash();
         command.args(["--bus", &url, "flash"]).arg(firmware::dir().join(name)).args(board);
         // The second time the running program gets the command to return to the bootloader.
-        let output = endpoint.run(&mut command);
-        assert!(output.status.success(), "{name}: {}", text(&output));
-        let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
-        assert!(output.status.success(), "{name}: {}", text(&output));
-        assert!(text(&output).contains("an application"), "{name}: {}", text(&output));
-        let mut session = endpoint.bench.session();
-        assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "{name} runs");
-        crcs.push(session.read_number(CRC).unwrap());
+        println!("{name}: {}", endpoint.succeed(&mut command));
+        let said = endpoint.succeed(coflash().args(["--bus", &url, "info"]));
+        assert!(said.contains("an application"), "{name}: {said}");
+        assert_eq!(endpoint.bench.number(0x1F51, 1), 1, "{name} runs");
+        crcs.push(endpoint.bench.number(0x1F56, 1));
         endpoint.bench.assert_takes_every_dlc();
     }
     assert_ne!(crcs[0], crcs[1], "another program");
     let bench = &mut endpoint.bench;
-    bench.power_off();
-    bench.run_ms(500);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     assert!(!bench.is_bootloader(NODE), "it starts by itself");
-    assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1]);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    assert_eq!(bench.number(0x1F56, 1), crcs[1]);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
-    assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1], "the bootloader says the same");
+    assert_eq!(bench.number(0x1F56, 1), crcs[1], "the bootloader says the same");
     let known: &[u32] = if versions[0] == "example-embassy.elf" { &OF_EMBASSY } else { &[] };
     let reports = bench.world.machine_mut(bench.device).reports();
     let others: Vec<_> = reports.iter().filter(|report| !known.contains(&report.address)).collect();
@@ -150,6 +126,11 @@ impl Project {
         assert_eq!(before.matches(old).count(), 1, "{file}: {old:?}");
         fs::write(&path, before.replace(old, new)).expect(file);
         self
+    }
+
+    /// Builds the project, which succeeds.
+    fn built(&self) -> PathBuf {
+        self.build(&[]).unwrap_or_else(|refused| panic!("{refused}"))
     }
 
     /// Builds the project with options of CMake.
@@ -215,11 +196,11 @@ fn another_number_of_vectors_than_the_chips_does_not_link() {
 fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     let project =
         Project::new("label").edit("main.c", "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n", "");
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
-    let (good, told) = judged(&["inspect"], &elf);
-    assert!(good && told.contains("can be a program") && !told.contains("  label "), "{told}");
+    let elf = project.built();
+    let (good, output) = judged(&["inspect"], &elf);
+    assert!(good && output.contains("can be a program") && !output.contains("  label "), "{output}");
     let blocks = firmware::blocks_of_file(&elf);
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().trial_run(false);
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
@@ -248,24 +229,24 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
 
     // With a linker script without the parts for coboot.
     let project = at_the_beginning("address").edit("app.x", "  INCLUDE coboot.x\n", "");
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let elf = project.built();
     for words in [&["convert"][..], &FLASH] {
-        let (good, told) = judged(words, &elf);
+        let (good, output) = judged(words, &elf);
         assert!(
             !good
-                && told.contains("lies outside 0x08020000..=0x080fffff: link the program for this region")
-                && told.contains("0x60000015"),
-            "{told}"
+                && output.contains("lies outside 0x08020000..=0x080fffff: link the program for this region")
+                && output.contains("0x60000015"),
+            "{output}"
         );
     }
 
     let map = stm32f407g_disc1_two::LAYOUT.linker_script(Image::Program(2)).to_string();
     let project = Project::new("address");
     fs::write(project.0.join(layout), map).unwrap();
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
-    let (good, told) = judged(&FLASH, &elf);
-    assert!(!good && told.contains("0x60000021"), "{told}");
-    assert!(told.contains("is linked for 08080000h, and the program begins at 08020000h"), "{told}");
+    let elf = project.built();
+    let (good, output) = judged(&FLASH, &elf);
+    assert!(!good && output.contains("0x60000021"), "{output}");
+    assert!(output.contains("is linked for 08080000h, and the program begins at 08020000h"), "{output}");
 }
 
 /// The stack begins at the end of the chip's RAM, as CubeMX lets it.
@@ -281,11 +262,11 @@ fn a_stack_over_the_handoff_is_refused_by_linker_and_coflash() {
 
     // Its folder is there as long as the project is.
     let project = top().edit("app.x", "  INCLUDE coboot.x\n", "");
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let elf = project.built();
     for words in [&["convert"][..], &FLASH] {
-        let (good, told) = judged(words, &elf);
+        let (good, output) = judged(words, &elf);
         let both = "its stack begins at 20020000h, over the handoff (2001FFC0h)";
-        assert!(!good && told.contains(both) && told.contains("0x60000021"), "{told}");
+        assert!(!good && output.contains(both) && output.contains("0x60000021"), "{output}");
     }
 }
 
@@ -306,12 +287,12 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
         "SCB_VTOR = (uint32_t)(uintptr_t)vectors;",
         "SCB_VTOR = 0x08000000;",
     );
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let elf = project.built();
     let blocks = firmware::blocks_of_file(&elf);
-    let mut bench = empty_board();
+    let mut bench = Bench::new().switched_on();
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
-    let told = refused.to_string();
-    assert!(told.contains("the trial failed") && told.contains("it does not start"), "{told}");
+    let output = refused.to_string();
+    assert!(output.contains("the trial failed") && output.contains("it does not start"), "{output}");
     // START starts it, and it ends by itself; then the bootloader stays.
     let resets = bench.events().len();
     assert_eq!(resets, 2);
@@ -325,7 +306,7 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     assert!(matches!(refused, Error::StartFailed { .. }), "{refused}");
     bench.run_ms(3000);
     assert!(bench.is_bootloader(NODE), "it has kept the device");
-    assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.crc(), "it is still there");
+    assert_eq!(bench.number(0x1F56, 1), blocks.crc(), "it is still there");
 }
 
 /// Each example in Rust can take the memory map of a board of one's own, as its page says: its
@@ -354,8 +335,7 @@ fn each_example_in_rust_takes_a_memory_map_from_a_file() {
         let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("of-file-target");
         let mut check = Command::new(cargo);
         check.args(["check", "--quiet"]).current_dir(&*project).env("CARGO_TARGET_DIR", target);
-        let output = check.output().expect("cargo starts");
-        assert!(output.status.success(), "{example}: {}", text(&output));
+        println!("{example}: {}", succeeded(&check.output().expect("cargo starts")));
     }
 }
 
@@ -382,10 +362,10 @@ fn the_blocks_of_the_page_for_cube_link_and_compile() {
     let before = fs::read_to_string(&script).unwrap();
     let (_, as_it_was) = before.split_once("  INCLUDE coboot.x\n").expect("the sample's script");
     fs::write(&script, format!("{}{as_it_was}", block(&page, "ld"))).unwrap();
-    let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let elf = project.built();
     // Its folder lasts as long as it does.
     let sample = Project::new("cube-sample");
-    let sample_elf = sample.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
+    let sample_elf = sample.built();
     assert_eq!(firmware::blocks_of_file(&elf), firmware::blocks_of_file(&sample_elf), "the same program");
 
     let hal = "#include <stdint.h>\ntypedef struct { int state; } CAN_HandleTypeDef;\n\
@@ -399,6 +379,5 @@ fn the_blocks_of_the_page_for_cube_link_and_compile() {
     let mut gcc = Command::new("arm-none-eabi-gcc");
     gcc.args(["-mcpu=cortex-m4", "-mthumb", "-std=gnu11", "-ffreestanding", "-Wall", "-Wextra", "-Werror"]);
     gcc.arg("-I").arg(house.join("examples/c")).arg("-c").arg(folder.join("main.c"));
-    let output = gcc.arg("-o").arg(folder.join("main.o")).output().expect("it can be started");
-    assert!(output.status.success(), "{}", text(&output));
+    println!("{}", succeeded(&gcc.arg("-o").arg(folder.join("main.o")).output().expect("it can be started")));
 }

@@ -1,6 +1,5 @@
 //! gdb with the emulated board: it stops in the application's 1F51h callback and in the bootloader
 //! after it, while a host calls the bootloader.
-use std::env;
 use std::fs::{self, File};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -9,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::tools::coflash;
 use emulator::gdb::Door;
 use emulator::pacing::{Pacer, Speed};
 use emulator::socketcand::Server;
@@ -76,7 +76,7 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     let mut desk = Desk::new(bench);
 
     let folder = kit::folder!("gdb-door");
-    let (said, told) = (folder.join("gdb.txt"), folder.join("coflash.txt"));
+    let (gdb_output, coflash_output) = (folder.join("gdb.txt"), folder.join("coflash.txt"));
     let bootloader = firmware::dir().join(firmware::BOOTLOADER);
     let mut gdb = Command::new("gdb-multiarch");
     gdb.args(["-nx", "-batch"]);
@@ -97,28 +97,26 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     ] {
         gdb.args(["-ex", command]);
     }
-    let mut gdb = spawn(gdb.arg(firmware::dir().join(firmware::APP_V1)), &said);
+    let mut gdb = spawn(gdb.arg(firmware::dir().join(firmware::APP_V1)), &gdb_output);
     desk.live_until("gdb connects", Desk::halted);
     desk.live_until("gdb lets it go on", |desk| !desk.halted());
 
-    let coflash = env::var_os("COBOOT_COFLASH")
-        .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
-    let mut enter = Command::new(coflash);
+    let mut enter = coflash();
     enter.args(["enter", "-N", &NODE.to_string(), "--bus"]);
     enter.arg(format!("socketcand://{}/can0", desk.server.address()));
-    let mut enter = spawn(&mut enter, &told);
+    let mut enter = spawn(&mut enter, &coflash_output);
     desk.live_until("gdb ends", |_| ended(&mut gdb));
     desk.live_until("coflash ends", |_| ended(&mut enter));
 
-    let (said, told) = (fs::read_to_string(said).unwrap(), fs::read_to_string(told).unwrap());
-    let mut rest = said.as_str();
+    let [said, coflash] = [gdb_output, coflash_output].map(|file| fs::read_to_string(file).unwrap());
+    let mut output = said.as_str();
     for words in
         ["Breakpoint 1", "#0  app_template::objects::{impl#1}::write_with_reply", "Breakpoint 2", "main + "]
     {
-        let at = rest.find(words).unwrap_or_else(|| panic!("{words:?} is missing:\n{said}"));
-        rest = &rest[at + words.len()..];
+        let at = output.find(words).unwrap_or_else(|| panic!("{words:?} is missing:\n{said}"));
+        output = &output[at + words.len()..];
     }
-    assert!(rest.contains("detached"), "{said}");
+    assert!(output.contains("detached"), "{said}");
     // The host's own time goes on while the board is halted, so the host may have given up.
-    assert!(desk.bench.is_bootloader(NODE), "{told}\n{said}");
+    assert!(desk.bench.is_bootloader(NODE), "{coflash}\n{said}");
 }

@@ -1,16 +1,14 @@
 //! A foreign master updates a node of `coboot-node --run`, and the downloaded program really runs: a
 //! Python program, in a ZIP file after the vector table (`docs/node.md`).
 
-use std::env;
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
+use coboot_tests::tools::{coflash, given, python, script, succeeded};
 use kit::folder::Folder;
-
-use crate::clients::{coflash, python, script, text};
 
 /// The head of a program as the page makes it: an initial stack pointer in RAM, a reset vector inside
 /// the program with the Thumb bit, and the rest of 512 bytes.
@@ -31,8 +29,10 @@ fn blocks(folder: &Folder, version: u8) -> String {
     );
     fs::write(app.join("__main__.py"), main).unwrap();
     let pyz = folder.join(format!("{name}.pyz"));
-    let done = python().args(["-m", "zipapp"]).arg(&app).arg("-o").arg(&pyz).output().unwrap();
-    assert!(done.status.success(), "{}", text(&done));
+    println!(
+        "{}",
+        succeeded(&python().args(["-m", "zipapp"]).arg(&app).arg("-o").arg(&pyz).output().unwrap())
+    );
     let mut program = [0; 512].to_vec();
     program[..8].copy_from_slice(&VECTORS);
     program.extend(fs::read(&pyz).unwrap());
@@ -40,8 +40,7 @@ fn blocks(folder: &Folder, version: u8) -> String {
     let blocks = folder.join(format!("{name}.blk"));
     let mut convert = coflash();
     convert.args(["convert", "-I", "binary", "--board", "stm32f407g-disc1"]).arg(bin).arg(&blocks);
-    let done = convert.output().unwrap();
-    assert!(done.status.success(), "{}", text(&done));
+    println!("{}", succeeded(&convert.output().unwrap()));
     blocks.to_str().unwrap().to_owned()
 }
 
@@ -58,9 +57,7 @@ impl Drop for Node {
 #[test]
 fn python_canopen_updates_a_node_whose_programs_run() {
     let folder = kit::folder!("hosted");
-    let node = env::var_os("COBOOT_NODE")
-        .unwrap_or_else(|| panic!("COBOOT_NODE is not set: run the tests by `cargo xtask test`"));
-    let mut node = Command::new(node);
+    let mut node = Command::new(given("COBOOT_NODE"));
     node.args(["--listen", "127.0.0.1:0", "--node", "9", "--flash", "instant", "--run"])
         .arg(python().get_program())
         .current_dir(&*folder)
@@ -76,11 +73,8 @@ fn python_canopen_updates_a_node_whose_programs_run() {
     let mut expected = String::new();
     for version in [1, 2] {
         let blocks = blocks(&folder, version);
-        let mut master = python();
-        master.arg(script("canopen_client.py")).args([&address, &blocks, "--node", "9"]);
-        let done = master.output().unwrap();
-        let said = text(&done);
-        assert!(done.status.success(), "{said}");
+        let mut master = script("canopen_client.py");
+        let said = succeeded(&master.args([&address, &blocks, "--node", "9"]).output().unwrap());
         assert_eq!(said.contains("called back into the bootloader"), version == 2, "{said}");
         assert!(said.contains("the application reports 1F51h = 01h and the same 1F56h"), "{said}");
         if version == 2 {

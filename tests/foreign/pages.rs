@@ -16,13 +16,14 @@
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 use std::{env, fs};
 
 use coboot_tests::firmware;
 use coboot_tests::masters::{lely, Master};
+use coboot_tests::tools::{given, succeeded, text};
 use kit::folder::Folder;
 use shared_abi::layout::stm32f407g_disc1;
 
@@ -268,12 +269,6 @@ fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|free| free.local_addr()).expect("a port").port()
 }
 
-fn given(name: &str) -> PathBuf {
-    env::var_os(name)
-        .unwrap_or_else(|| panic!("{name} is not set: run the tests by `cargo xtask test`"))
-        .into()
-}
-
 /// What the words of the pages mean here. `serve` starts a program that offers the page's bus, in
 /// place of the one before it, and waits until it can be reached; `bus` does so for the bus of
 /// `COFLASH_BUS`. A job that is no build must be one that ends at once.
@@ -368,10 +363,6 @@ fn program(page: &str, folder: &Folder, port: u16) -> String {
     program.replace(PORT, &port.to_string())
 }
 
-fn text(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
-
 /// Types a page.
 fn run(page: &str) {
     let folder = reader(page);
@@ -420,8 +411,11 @@ fn lelys_recipe_updates_the_node_of_the_page() {
     let of = |words: &str| blocks.iter().find(|block| block.code.contains(words)).expect("it is on the page");
     folder.write("master.yml", &of("software_file").code);
     let dcfgen = given("COBOOT_PYTHON").with_file_name("dcfgen");
-    let output = Command::new(dcfgen).args(["-d", ".", "master.yml"]).current_dir(&*folder).output().unwrap();
-    assert!(output.status.success(), "{}", text(&output));
+    let mut dcfgen = Command::new(dcfgen);
+    println!(
+        "{}",
+        succeeded(&dcfgen.args(["-d", ".", "master.yml"]).current_dir(&*folder).output().unwrap())
+    );
     let dcf = fs::read_to_string(folder.join("master.dcf")).unwrap();
     assert!(expected(&dcf, "1F86").is_some(), "{dcf}");
 
@@ -437,9 +431,9 @@ fn lelys_recipe_updates_the_node_of_the_page() {
         })
         .expect("the node offers its bus");
     let image = firmware::raw(firmware::APP_V1);
-    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image);
+    let crc = kit::crc::crc32(&image);
     // Twice: the second time a program runs.
-    let told: Result<(), String> = (|| {
+    let outcome: Result<(), String> = (|| {
         for _ in 0..2 {
             compare(&dcf, &mut *bus)?;
             lely(&mut *bus, 1, &image, crc)?;
@@ -448,7 +442,7 @@ fn lelys_recipe_updates_the_node_of_the_page() {
         Ok(())
     })();
     node.kill().and_then(|()| node.wait()).expect("it ends");
-    assert_eq!(told, Ok(()));
+    assert_eq!(outcome, Ok(()));
 }
 
 fn compare(dcf: &str, bus: &mut dyn coboot_can::Adapter) -> Result<(), String> {

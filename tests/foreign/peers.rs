@@ -1,14 +1,10 @@
 //! python-canopen, unmodified, as the master of a bus with three emulated devices, through the
 //! socketcand endpoint.
 
-use std::env;
-use std::path::Path;
-use std::process::Command;
-
 use canopen::{Address, BitRate};
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::firmware;
+use coboot_tests::{firmware, tools};
 use coflash_core::file::block_file::emit;
 use emulator::bus::Outcome;
 
@@ -16,16 +12,9 @@ const NODES: [u8; 3] = [10, 11, 12];
 
 /// Runs the script on the endpoint; returns its output.
 fn master(endpoint: &mut Endpoint, arguments: &[&str]) -> String {
-    let python = env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/master_client.py");
-    let mut command = Command::new(python);
-    command.arg(script).arg(endpoint.address()).args(arguments).args(NODES.map(|node| node.to_string()));
-    let output = endpoint.run(&mut command);
-    let said =
-        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{said}");
-    said
+    let mut client = tools::script("master_client.py");
+    client.arg(endpoint.address()).args(arguments).args(NODES.map(|node| node.to_string()));
+    endpoint.succeed(&mut client)
 }
 
 /// Three devices without node-ID are found by fastscan and get node-ID and bit rate; after a

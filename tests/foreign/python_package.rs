@@ -9,24 +9,14 @@ use std::{env, fs};
 use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::endpoint::Endpoint;
+use coboot_tests::tools::{python, succeeded, text};
 use coboot_tests::{firmware, sealed_board};
 use kit::folder::Alone;
-
-/// The python of `cargo xtask test`, with the pinned third-party packages.
-fn python() -> Command {
-    let python = env::var_os("COBOOT_PYTHON")
-        .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    Command::new(python)
-}
 
 /// Runs a program to its end.
 #[track_caller]
 fn done(command: &mut Command) -> String {
-    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-    let said =
-        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{command:?}:\n{said}");
-    said
+    succeeded(&command.output().unwrap_or_else(|error| panic!("{command:?}: {error}")))
 }
 
 /// The only file in a folder.
@@ -113,13 +103,11 @@ fn a_sealed_device_is_updated_from_python() {
     for (name, bytes) in [("genuine.cbs", &genuine), ("flipped.cbs", &flipped)] {
         python.arg(folder.write(name, bytes));
     }
-    let output = endpoint.run(&mut python);
-    let said = [&output.stdout[..], &output.stderr[..]].concat();
-    let said = String::from_utf8_lossy(&said);
+    let said = text(&endpoint.run(&mut python));
     let lines: Vec<&str> = said.lines().collect();
     let [taken, refused] = lines.as_slice() else { panic!("{said}") };
     assert!(refused.starts_with("0x6000018a: ") && refused.contains("signature"), "{said}");
-    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image);
+    let crc = kit::crc::crc32(&image);
     assert_eq!(*taken, format!("{} bytes, CRC {crc:08X}", image.len()));
     endpoint.bench.session().command(1, ProgramControl::Start).unwrap();
     // It remembers a bad signature for 32 s, and does not leave before (docs/security.md).

@@ -1,6 +1,5 @@
 //! A board with its transceiver at CAN2: the same job through the other controller.
 
-use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
@@ -98,26 +97,22 @@ fn an_update_and_the_way_back_through_can2() {
     let report = flash(&mut bench.session(), blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "1.0.0");
     assert!(!bench.is_bootloader(1));
-    let identification = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
+    let identification = bench.number(0x1F56, 1);
     assert_eq!(identification, report.program_crc);
     // Priorities 3 and 4.
     assert_set_up(&mut bench, [0xD0, 0xC0]);
 
     // Back to the bootloader, and to the program again without a download.
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    bench.call_back();
     assert!(bench.is_bootloader(1));
     assert_set_up(&mut bench, [0xE0, 0xD0]);
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    bench.start_program();
     assert_eq!(version(&mut bench), "1.0.0");
 
     // The next version, from the running application; it starts by itself.
     flash(&mut bench.session(), blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
     assert_eq!(version(&mut bench), "2.0.0");
-    bench.power_off();
-    bench.run_ms(500);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_program(1000);
     assert_eq!(version(&mut bench), "2.0.0");
 

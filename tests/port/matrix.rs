@@ -87,17 +87,17 @@ fn logs(way: &str, listener: impl Fn(&str) -> Listener) {
         let Some(mut bench) = board(&name) else { return };
         let mut listener = listener(&firmware::of_board(LAYOUT.board, &format!("{name}.elf")));
         // 6: no valid program.
-        let told = listener.told(&mut bench);
-        assert_eq!(told.first().map(String::as_str), Some("stayed in the bootloader; why 00000006"));
+        let lines = listener.lines(&mut bench);
+        assert_eq!(lines.first().map(String::as_str), Some("stayed in the bootloader; why 00000006"));
         play(&mut bench, dialect, "app-lift.elf", &image);
         // A session ends in the application or in the bootloader, which then logs its refusal.
         if bench.is_bootloader(dialect.node) {
-            listener.told(&mut bench);
+            listener.lines(&mut bench);
             // 1F51h/1 = 7Fh (CiA 301 section 7.2.4.3.3: expedited, one byte).
             bench.post(0x600 + u16::from(dialect.node), &[0x2F, 0x51, 0x1F, 0x01, 0x7F, 0, 0, 0]);
             bench.run_ms(20);
-            let told = listener.told(&mut bench);
-            assert!(told.iter().any(|line| line == "1F51h; program and command 0000017F"), "{told:?}");
+            let lines = listener.lines(&mut bench);
+            assert!(lines.iter().any(|line| line == "1F51h; program and command 0000017F"), "{lines:?}");
         }
         bench.assert_nothing_unmodelled();
     }
@@ -231,33 +231,27 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
 
     let file = file(Checksum::Crc16);
     let crc = firmware::raw_from(LAYOUT.programs[0].base, &image(firmware::APP_V1));
-    let crc = crc16(&crc[..file.size() as usize]);
+    let crc = kit::bench::crc16(&crc[..file.size() as usize]);
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     let mut session = bench.session();
     coflash_core::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     assert_eq!(session.read_number(Address::new(0x1F56, 1)).unwrap(), crc);
 
     // It is not confirmed yet: boot-up message of the bootloader, and of the program 300 ms later.
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(100);
     bench.await_boot_up(400);
     assert!(!bench.is_bootloader(NODE));
     // Called back, it is confirmed; after START, and after the next power-on, only the program
     // sends a boot-up message.
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(500);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(500);
+    bench.start_program();
     assert!(!bench.is_bootloader(NODE));
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
+    bench.power_cycle();
     bench.await_boot_up(100);
     assert!(!bench.is_bootloader(NODE));
-    assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
+    assert_eq!(bench.number(0x1F56, 1), crc);
 
     // The boot stage detects one changed bit.
     bench.power_off();
@@ -268,13 +262,4 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(NODE));
     bench.assert_nothing_unmodelled();
-}
-
-/// From its definition: polynomial 1021h, start 0 (CiA 301 section 7.2.4.3.16).
-fn crc16(bytes: &[u8]) -> u32 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
-            (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
-        })
-    })
 }

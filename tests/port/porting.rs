@@ -161,9 +161,9 @@ fn a_board_is_made_as_the_guide_says() {
     copy.xtask(&["build", "bootloader", "app-v1", "app-v2", "app-c", "--board", "my-board"]);
     assert!(app_c.exists(), "no application in C");
     // The main job, in the emulator.
-    let told = copy.xtask(&["demo", "--board", "my-board"]);
-    assert!(told.contains("An emulated my-board"), "{told}");
-    assert!(told.contains("a node of my own"), "the device does not say its name:\n{told}");
+    let output = copy.xtask(&["demo", "--board", "my-board"]);
+    assert!(output.contains("An emulated my-board"), "{output}");
+    assert!(output.contains("a node of my own"), "the device does not say its name:\n{output}");
 }
 
 /// A later RAM image for devices in the field: it is built for the resident part that they have.
@@ -277,8 +277,8 @@ fn a_board_is_made_for_every_chip() {
     }
     for chip in chips.split(',') {
         let started = std::time::Instant::now();
-        let told = copy.xtask(&["demo", "--board", chip]);
-        assert!(told.contains(&format!("An emulated {chip}")), "{told}");
+        let output = copy.xtask(&["demo", "--board", chip]);
+        assert!(output.contains(&format!("An emulated {chip}")), "{output}");
         println!("{chip}: {} s", started.elapsed().as_secs());
     }
 }
@@ -344,9 +344,10 @@ const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
 /// A mistake in the choices of a product.
 fn product(&(choices, says): &(&str, &'static str)) -> Mistake {
-    let rest = if choices.contains("..Product::of") { "" } else { ", ..Product::DEFAULT" };
+    let default = if choices.contains("..Product::of") { "" } else { ", ..Product::DEFAULT" };
     // The one of the file becomes another constant.
-    let wrong = format!("= Product {{ {choices}{rest} }};\npub const _OF_FILE: Product = Product {{").leak();
+    let wrong =
+        format!("= Product {{ {choices}{default} }};\npub const _OF_FILE: Product = Product {{").leak();
     ("bootloader/products/default.rs", "= Product {", wrong, By::Product(None), says)
 }
 
@@ -462,7 +463,7 @@ fn the_lines_for_two_banks_and_for_can2_compile() {
     copy.xtask(&["new-board", "two-banks", "--chip", "STM32F429ZGT6"]);
     let page = fs::read_to_string(copy.root.join("docs/porting.md")).expect("the guide");
     let block = |words: &str| {
-        let blocks = page.split("```rust\n").skip(1).filter_map(|rest| rest.split("```").next());
+        let blocks = page.split("```rust\n").skip(1).filter_map(|block| block.split("```").next());
         blocks.into_iter().find(|block| block.contains(words)).expect(words)
     };
     let map = "shared-abi/src/layout/boards/two_banks.rs";
@@ -497,7 +498,7 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     assert!(!copy.root.join("bsp/src/boards/x.rs").exists(), "a file was written");
     let board = "nucleo-f446re";
     let triple = ["--target", TARGET, "--profile=firmware"];
-    let look = |by: By| match by {
+    let check = |by: By| match by {
         By::Layout => copy.cargo(&["check", "-p", "coboot-abi"]),
         By::Board => copy.cargo_for(board, None, &["check", "-p", "bsp"]),
         By::BoardOf(board) => copy.cargo_for(board, None, &["check", "-p", "bsp"]),
@@ -515,12 +516,12 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let slower = [By::BoardOf("an-f412"), By::BoardOf("an-f413")];
     let good = [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least"))];
     for by in good.into_iter().chain(slower) {
-        let output = look(by);
+        let output = check(by);
         assert!(output.status.success(), "{}", text(&output));
     }
     for (file, right, wrong, by, says) in PRODUCTS.iter().map(product).chain(MISTAKES.iter().copied()) {
         let before = copy.edit(file, right, wrong);
-        let output = look(by);
+        let output = check(by);
         fs::write(copy.root.join(file), before).expect("the file can be written");
         let said = text(&output);
         assert!(!output.status.success(), "built with {wrong} in {file}");

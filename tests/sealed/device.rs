@@ -132,7 +132,7 @@ fn a_sealed_device_can_be_looked_into_during_development() {
     let mut listener = Listener::probe();
     let mut bench = board_of(firmware::BOOTLOADER_SEALED_LOG_RTT).switched_on();
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
-    let lines = listener.told(&mut bench);
+    let lines = listener.lines(&mut bench);
     assert!(lines.iter().any(|line| line == "1F51h; program and command 00000103"), "{lines:?}");
     start(&mut bench, firmware::APP_V1, "1.0.0");
 

@@ -9,7 +9,7 @@ use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions, Report};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
 use emulator::machine::{Machine, Options, Stop, Usart};
@@ -332,17 +332,33 @@ impl Bench {
         self.await_program_of(NODE, within_ms)
     }
 
+    /// Calls the running program back: the bootloader has sent its boot-up message, at this time.
+    ///
+    /// # Panics
+    /// If the device does not return.
+    pub fn call_back(&mut self) -> Time {
+        self.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
+        self.await_boot_up(1000)
+    }
+
+    /// Starts program 1 from the bootloader: it has sent its boot-up message, at this time.
+    ///
+    /// # Panics
+    /// If it does not start.
+    pub fn start_program(&mut self) -> Time {
+        self.session().command(1, ProgramControl::Start).expect("it is answered");
+        self.await_boot_up(1000)
+    }
+
     /// Makes the running program call the bootloader, which confirms the program, and starts it
     /// again.
     ///
     /// # Panics
     /// If the device does not return, or the program does not start.
     pub fn confirm_program(&mut self) {
-        self.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
-        self.await_boot_up(1000);
+        self.call_back();
         self.run_ms(20);
-        self.session().command(1, ProgramControl::Start).expect("it is answered");
-        self.await_boot_up(1000);
+        self.start_program();
     }
 
     /// Switches the board on: its bootloader has sent its boot-up.
@@ -360,14 +376,53 @@ impl Bench {
         self.power_on();
     }
 
+    /// The same; the program runs.
+    ///
+    /// # Panics
+    /// If it does not start.
+    pub fn restart(&mut self) {
+        self.power_cycle();
+        self.await_program(1000);
+        self.events();
+    }
+
+    /// Protects the parameters against writing, as somebody could by the option bytes, or no longer.
+    ///
+    /// # Panics
+    /// Never: they are in flash.
+    pub fn protect_parameters(&mut self, is_protected: bool) {
+        let board = firmware::board();
+        for region in board.parameters {
+            let sector = board.chip.sector_at(region.base).expect("it is in flash");
+            self.machine().protect_sector(sector.number, is_protected);
+        }
+    }
+
+    /// Writes these words to the warm-start cell.
+    ///
+    /// # Panics
+    /// Never: it is in RAM.
+    pub fn set_warm_start(&mut self, words: [u32; 4]) {
+        let bytes = words.map(u32::to_le_bytes).concat();
+        self.machine().write_ram(firmware::board().warm_start.base, &bytes).expect("it is in RAM");
+    }
+
+    /// Overwrites the instruction at which the core sleeps: `idle` is in RAM.
+    ///
+    /// # Panics
+    /// If the core does not sleep in RAM.
+    pub fn replace_idle(&mut self, instruction: u16) {
+        let at = self.machine().pc();
+        self.machine().write_ram(at, &instruction.to_le_bytes()).expect("idle sleeps in RAM");
+    }
+
     /// The boot-up messages after this start: one of the program, and one before it of the
     /// bootloader if the program has a rescue window.
     pub fn boot_ups(&mut self, start: fn(&mut Self)) -> usize {
         let from = self.time();
         start(self);
         self.run_ms(RESCUE_WINDOW_MS + 200);
-        let frames = self.frames_since(from);
-        frames.iter().filter(|(_, id, data)| *id == HEARTBEAT && data[..] == [0]).count()
+        self.frames_of(HEARTBEAT, from).iter().filter(|(_, data)| data[..] == [0]).count()
     }
 
     /// The machine of the running application moves from now on, or stands: of the template by the
@@ -394,6 +449,19 @@ impl Bench {
         good.map(|record| (record.end, record.frame.raw_id(), record.frame.data().to_vec())).collect()
     }
 
+    /// The same of the frames with this identifier.
+    #[must_use]
+    pub fn frames_of(&self, id: u32, from: Time) -> Vec<(Time, Vec<u8>)> {
+        let frames = self.frames_since(from).into_iter().filter(|(_, of, _)| *of == id);
+        frames.map(|(at, _, data)| (at, data)).collect()
+    }
+
+    /// The emergencies of the board with [`NODE`].
+    #[must_use]
+    pub fn emergencies(&self, from: Time) -> Vec<Vec<u8>> {
+        self.frames_of(0x80 + u32::from(NODE), from).into_iter().map(|(_, data)| data).collect()
+    }
+
     /// Every record of the bus so far, including errors.
     #[must_use]
     pub fn records(&self) -> Vec<Record> {
@@ -413,6 +481,11 @@ impl Bench {
     /// The resets and other events of the board that were not read yet.
     pub fn events(&mut self) -> Vec<(Time, Stop)> {
         std::iter::from_fn(|| self.world.news()).map(|news| (news.at, news.stop)).collect()
+    }
+
+    /// The same without their times.
+    pub fn stops(&mut self) -> Vec<Stop> {
+        self.events().into_iter().map(|(_, stop)| stop).collect()
     }
 
     /// Sends a raw frame from the host, and does not wait.
@@ -444,17 +517,27 @@ impl Bench {
         }
     }
 
+    /// A board in its bootloader, at this bit rate.
+    ///
+    /// # Panics
+    /// If it refuses the bit rate.
+    #[must_use]
+    pub fn at_rate(rate: BitRate) -> Self {
+        let mut bench = Self::new();
+        bench.commission(bench.device, NODE, rate);
+        bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
+        bench.power_on();
+        bench.await_boot_up(1000);
+        bench
+    }
+
     /// A board at this bit rate that runs this application.
     ///
     /// # Panics
     /// If it cannot be installed.
     #[must_use]
     pub fn running(rate: BitRate, image: &str) -> Self {
-        let mut bench = Self::new();
-        bench.commission(bench.device, NODE, rate);
-        bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
-        bench.power_on();
-        bench.await_boot_up(1000);
+        let mut bench = Self::at_rate(rate);
         bench.install(image);
         bench.run_ms(100);
         bench.events();
@@ -465,10 +548,34 @@ impl Bench {
     ///
     /// # Panics
     /// If the board does not take it.
-    pub fn install(&mut self, image: &str) {
+    pub fn install(&mut self, image: &str) -> Report {
         let options = FlashOptions::default().trial_run(false);
-        let installed = flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {});
-        installed.expect("it is installed");
+        flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {}).expect("it is installed")
+    }
+
+    /// The whole procedure of the tool with its default options.
+    ///
+    /// # Panics
+    /// If it fails.
+    pub fn update(&mut self, image: &str) -> Report {
+        let options = FlashOptions::default();
+        flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {}).expect("an update")
+    }
+
+    /// Reads a number of up to 32 bits.
+    ///
+    /// # Panics
+    /// If the board has another answer.
+    pub fn number(&mut self, index: u16, sub: u8) -> u32 {
+        self.session().read_number(Address::new(index, sub)).expect("a number")
+    }
+
+    /// Reads a text.
+    ///
+    /// # Panics
+    /// If the board has another answer.
+    pub fn text(&mut self, index: u16) -> String {
+        self.session().read_text(Address::new(index, 0)).expect("a text")
     }
 
     /// Sends frames of eight bytes with each data length code that means eight (ISO 11898-1:2015, table 5), to
@@ -546,8 +653,8 @@ impl Bench {
     /// # Panics
     /// If it does not answer.
     pub fn is_bootloader(&mut self, node: u8) -> bool {
-        let told = self.session_with(node).device_type().expect("an answer");
-        told.expect("1000h is mandatory").is_bootloader()
+        let device_type = self.session_with(node).device_type().expect("an answer");
+        device_type.expect("1000h is mandatory").is_bootloader()
     }
 
     /// Fails if the firmware of any board accessed anything that the emulator does not model.

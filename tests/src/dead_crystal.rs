@@ -1,7 +1,6 @@
 //! A program on a board whose crystal has failed: it must not speak from the internal oscillator, which CAN does
 //! not tolerate, and must not wait for the crystal, or the device could not be reached any more.
 
-use canopen::Address;
 use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
@@ -12,10 +11,8 @@ use emulator::time::Time;
 use crate::bench::{Bench, BIT_RATE, NODE};
 use crate::firmware;
 
-/// 2007h, the device state: why it stays in the bootloader, 2 for a crash loop; and the source of the clock, 2 for the
-/// internal oscillator (docs/protocol.md).
-const WHY: Address = Address::new(0x2007, 2);
-const CLOCK: Address = Address::new(0x2007, 5);
+/// 2007h/2, why it stays in the bootloader: a crash loop; and 2007h/5, the source of the clock: the internal oscillator
+/// (docs/protocol.md).
 const CRASH_LOOP: u32 = 2;
 const INTERNAL: u32 = 2;
 /// The time for three starts with their rescue windows, with room to spare.
@@ -65,8 +62,7 @@ pub fn brings_the_bootloader(program: &Program) {
             bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
             bench.run_ms(200);
             assert!(bench.is_bootloader(NODE));
-            let mut number = |at| bench.session().read_number(at).expect("an answer");
-            assert_eq!([number(WHY), number(CLOCK)], [CRASH_LOOP, INTERNAL]);
+            assert_eq!([bench.number(0x2007, 2), bench.number(0x2007, 5)], [CRASH_LOOP, INTERNAL]);
         }
     }
     // A power-on begins a new count.

@@ -180,10 +180,10 @@ impl Image {
         let mut eds = Ini(String::new());
         self.about(&mut eds);
         let indices = self.indices();
-        let (mandatory, rest): (Vec<u16>, Vec<u16>) =
+        let (mandatory, others): (Vec<u16>, Vec<u16>) =
             indices.iter().partition(|index| matches!(index, 0x1000 | 0x1001 | 0x1018));
         let (manufacturer, optional): (Vec<u16>, Vec<u16>) =
-            rest.iter().partition(|index| matches!(index, 0x2000..=0x5FFF));
+            others.iter().partition(|index| matches!(index, 0x2000..=0x5FFF));
         for (list, of) in [
             ("MandatoryObjects", mandatory),
             ("OptionalObjects", optional),

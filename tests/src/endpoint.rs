@@ -9,6 +9,7 @@ use emulator::serial::Serial;
 use emulator::socketcand::Server;
 
 use crate::bench::Bench;
+use crate::tools;
 
 /// How long a client may take before it counts as hanging, on the wall clock.
 const PATIENCE: Duration = Duration::from_secs(300);
@@ -69,6 +70,15 @@ impl Endpoint {
             Some(serial) => format!("slcan:{}@125k", serial.place()),
             None => format!("socketcand://{}/can0", self.address()),
         }
+    }
+
+    /// Runs a program, which must succeed; returns what it has printed.
+    ///
+    /// # Panics
+    /// If it fails.
+    #[track_caller]
+    pub fn succeed(&mut self, command: &mut Command) -> String {
+        tools::succeeded(&self.run(command))
     }
 
     /// Runs a program until it ends; the board runs meanwhile.

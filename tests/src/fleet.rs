@@ -40,13 +40,15 @@ impl Update {
     }
 }
 
-/// Something that happens on the bus during an update, at each access of the host.
+/// Something that happens on the bus, at each access of the host.
 pub type Happens<'h> = &'h mut dyn FnMut(&mut Bench);
 
 /// A bus on which something happens.
-struct Eventful<'b> {
-    bench: &'b mut Bench,
-    happens: Happens<'b>,
+pub struct Eventful<'b> {
+    /// The boards.
+    pub bench: &'b mut Bench,
+    /// What happens.
+    pub happens: Happens<'b>,
 }
 
 impl Adapter for Eventful<'_> {
@@ -149,9 +151,9 @@ impl Fleet {
         };
         let jobs: Vec<Job> = (1..=devices).map(job).collect();
         let events = Mutex::new(Vec::new());
-        let tell = |device, event| events.lock().expect("no panic").push((device, event));
+        let record = |device, event| events.lock().expect("no panic").push((device, event));
         let mut bus = Eventful { bench: &mut self.bench, happens };
-        let results = flash_many(&mut bus, &jobs, options, &tell);
+        let results = flash_many(&mut bus, &jobs, options, &record);
         let took = Duration::from_nanos((self.bench.time() - began).0 / 1000);
         Update { took, results, events: events.into_inner().expect("no panic") }
     }
@@ -165,7 +167,7 @@ pub fn file(kib: u32) -> Arc<Program> {
 
 /// How a program gets to several boards.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Way {
+pub enum Distribution {
     /// In one download for all.
     Together,
     /// In a download for each, at the same time.
@@ -177,8 +179,8 @@ pub enum Way {
 pub struct Measurement {
     /// The number of boards.
     pub boards: u8,
-    /// The way.
-    pub way: Way,
+    /// How it gets to them.
+    pub distribution: Distribution,
     /// Bytes of a block, including framing.
     pub block_size: usize,
     /// One of so many frames is lost; 0 for none.
@@ -198,28 +200,28 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
     let file = file(256);
     let own = DEFAULT_BLOCK_SIZE;
     let rows = [
-        (1, Way::OneByOne, own, 0),
-        (2, Way::Together, JOINED_BLOCKS, 0),
-        (4, Way::Together, JOINED_BLOCKS, 0),
-        (8, Way::Together, JOINED_BLOCKS, 0),
-        (8, Way::OneByOne, own, 0),
-        (8, Way::Together, JOINED_BLOCKS, 100_000),
-        (8, Way::Together, JOINED_BLOCKS, 1000),
-        (1, Way::OneByOne, own, 1000),
-        (8, Way::Together, own, 0),
-        (8, Way::Together, own, 1000),
+        (1, Distribution::OneByOne, own, 0),
+        (2, Distribution::Together, JOINED_BLOCKS, 0),
+        (4, Distribution::Together, JOINED_BLOCKS, 0),
+        (8, Distribution::Together, JOINED_BLOCKS, 0),
+        (8, Distribution::OneByOne, own, 0),
+        (8, Distribution::Together, JOINED_BLOCKS, 100_000),
+        (8, Distribution::Together, JOINED_BLOCKS, 1000),
+        (1, Distribution::OneByOne, own, 1000),
+        (8, Distribution::Together, own, 0),
+        (8, Distribution::Together, own, 1000),
     ];
     let mut one = None;
-    for (boards, way, block_size, lost_one_in) in rows {
+    for (boards, distribution, block_size, lost_one_in) in rows {
         fleet.bench.world.clear_faults();
         if lost_one_in != 0 {
             fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
         }
-        let options = ManyOptions::default().together(way == Way::Together);
+        let options = ManyOptions::default().together(distribution == Distribution::Together);
         let each = unwatched().joined_blocks(Some(block_size));
         let update = fleet.update_as(boards, &Payload::Program(file.clone()), &each, &options, &mut |_| {});
-        assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
+        assert_eq!(update.done(), usize::from(boards), "{distribution:?}, one of {lost_one_in} lost");
         let (took, one) = (update.took, *one.get_or_insert(update.took));
-        row(Measurement { boards, way, block_size, lost_one_in, took, one });
+        row(Measurement { boards, distribution, block_size, lost_one_in, took, one });
     }
 }

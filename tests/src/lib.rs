@@ -21,3 +21,4 @@ pub mod serial;
 pub mod silicon;
 pub mod stack;
 pub mod throughput;
+pub mod tools;

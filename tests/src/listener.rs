@@ -39,7 +39,7 @@ impl Listener {
     ///
     /// # Panics
     /// If the UART's output is not text.
-    pub fn told(&mut self, bench: &mut Bench) -> Vec<String> {
+    pub fn lines(&mut self, bench: &mut Bench) -> Vec<String> {
         match self {
             Self::Probe(reader) => reader.lines(bench.machine(), firmware::board().chip.sram),
             Self::Terminal(line) => {

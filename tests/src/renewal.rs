@@ -8,8 +8,8 @@ use coflash_core::device::Doing;
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::read::{read, Firmware, Format};
 use coflash_core::update::Payload;
-use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::time::Span;
+use kit::crc::crc32;
 use shared_abi::geometry::Region;
 use shared_abi::renewal::{Progress, State};
 
@@ -34,7 +34,7 @@ pub fn image_of(bootloader: &str) -> Vec<u8> {
 /// The image with the right CRC in its header.
 #[must_use]
 pub fn with_crc(mut image: Vec<u8>) -> Vec<u8> {
-    let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&image[8..]);
+    let crc = crc32(&image[8..]);
     image[4..8].copy_from_slice(&crc.to_le_bytes());
     image
 }
@@ -77,7 +77,7 @@ pub fn crc_of(image: &[u8]) -> u32 {
 /// # Panics
 /// If the device does not answer.
 pub fn progress(bench: &mut Bench) -> Progress {
-    let word = bench.session().read_number(Address::new(DEVICE_STATE, STATE_RENEWAL)).expect("an answer");
+    let word = bench.number(DEVICE_STATE, STATE_RENEWAL);
     Progress::from_bytes(word.to_le_bytes()).expect("an answer")
 }
 

@@ -25,11 +25,9 @@
 use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
-use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
-use coboot_can::Adapter;
 use coflash_core::device::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;
@@ -45,14 +43,14 @@ const PATIENCE_MS: u64 = 3000;
 
 /// The connection between the master of a session and the device.
 pub trait Wire {
-    /// Virtual time.
-    fn time(&self) -> Time;
+    /// The bench of the device.
+    fn bench(&mut self) -> &mut Bench;
+    /// Switches the device off and on.
+    fn power_cycle(&mut self) {
+        self.bench().power_cycle();
+    }
     /// Runs for this time.
     fn run_ms(&mut self, ms: u64);
-    /// Switches the device off.
-    fn power_off(&mut self);
-    /// Switches the device on.
-    fn power_on(&mut self);
     /// Sends a frame of the master, and does not wait.
     fn send(&mut self, id: u16, data: &[u8]);
     /// The frames that began at or after this time, as end, identifier and data.
@@ -62,20 +60,12 @@ pub trait Wire {
 }
 
 impl Wire for Bench {
-    fn time(&self) -> Time {
-        self.time()
+    fn bench(&mut self) -> &mut Bench {
+        self
     }
 
     fn run_ms(&mut self, ms: u64) {
         self.run_ms(ms);
-    }
-
-    fn power_off(&mut self) {
-        self.power_off();
-    }
-
-    fn power_on(&mut self) {
-        self.power_on();
     }
 
     fn send(&mut self, id: u16, data: &[u8]) {
@@ -89,7 +79,7 @@ impl Wire for Bench {
     fn session_with(&mut self, node: u8) -> Session<'_> {
         // Frames that arrived were checked on the bus; a session must not take them for its
         // answers.
-        while self.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
+        self.forget_received();
         self.session_with(node)
     }
 }
@@ -113,7 +103,7 @@ pub fn play_on(wire: &mut dyn Wire, script: &str, board: &Layout, image: &dyn Fn
     let programs = board.programs.len() as u8;
     let highest = board.staging.map_or(programs, |_| renewal::number(programs, None));
     let named = HashMap::from([("p0".to_owned(), highest)]);
-    let mut player = Player { seen: wire.time(), node: 1, wire, board, image, named };
+    let mut player = Player { seen: wire.bench().time(), node: 1, wire, board, image, named };
     for (number, line) in (1..).zip(text.lines()) {
         let place = format!("{script}, line {number}: {line}");
         match line.trim() {
@@ -164,7 +154,7 @@ impl Player<'_> {
             if id > 0x600 && id < 0x680 {
                 self.node = (id - 0x600) as u8;
             }
-            self.seen = self.wire.time();
+            self.seen = self.wire.bench().time();
             let known =
                 |byte: &Byte| self.value(byte).unwrap_or_else(|| panic!("{place}: the master knows it not"));
             let data: Vec<u8> = bytes.iter().map(known).collect();
@@ -185,7 +175,7 @@ impl Player<'_> {
 
     /// The next frame of the device; heartbeats are skipped unless one is expected.
     fn expect(&mut self, id: u32, bytes: &[Byte], place: &str) {
-        let deadline = self.wire.time() + Span::from_millis(PATIENCE_MS);
+        let deadline = self.wire.bench().time() + Span::from_millis(PATIENCE_MS);
         loop {
             let frames = self.wire.frames_since(self.seen);
             let of_device = |(_, id, _): &&(Time, u32, Vec<u8>)| !matches!(id, 0 | 0x601..=0x67F | 0x7E5);
@@ -203,7 +193,7 @@ impl Player<'_> {
                 let heartbeat = (0x701..=0x77F).contains(found) && data[..] != [0];
                 assert!(heartbeat, "{place}: the device sent {found:03X}#{data:02X?}");
             }
-            assert!(self.wire.time() < deadline, "{place}: the device is silent");
+            assert!(self.wire.bench().time() < deadline, "{place}: the device is silent");
             self.wire.run_ms(1);
         }
     }
@@ -228,16 +218,14 @@ impl Player<'_> {
                 assert!(status.is_ok(), "{place}: {status:?}");
             }
             ["@power"] => {
-                self.wire.power_off();
-                self.wire.run_ms(100);
-                self.seen = self.wire.time();
-                self.wire.power_on();
+                self.wire.power_cycle();
+                self.seen = self.wire.bench().time();
             }
             _ => panic!("{place}: nobody knows what that is"),
         }
         // Frames that arrived meanwhile were checked.
         if words[0] != "@power" {
-            self.seen = self.wire.time();
+            self.seen = self.wire.bench().time();
         }
     }
 
@@ -257,7 +245,7 @@ impl Player<'_> {
     fn part(&mut self, data: &[u8]) {
         let (request, response) = (0x600 + u16::from(self.node), 0x580 + u32::from(self.node));
         let mut ask = |bytes: &[u8; 8], answer: [u8; 8]| {
-            self.seen = self.wire.time();
+            self.seen = self.wire.bench().time();
             self.wire.send(request, bytes);
             self.expect(response, &answer.map(Byte::Is), "@part");
         };

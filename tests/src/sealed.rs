@@ -1,6 +1,8 @@
 //! A device that accepts only sealed images, on the flash model: its trusted keys, the files for
 //! it, and the permitted contents of its flash.
 
+use std::ops::{Deref, DerefMut};
+
 use boot_core::bootloader::Everything;
 use boot_core::canopen::od::Address;
 use boot_core::canopen::{AbortCode, Instant};
@@ -165,46 +167,26 @@ pub struct Host<'a> {
     pub now: u32,
 }
 
-impl Host<'_> {
-    /// Runs until there is no work.
-    pub fn settle(&mut self) {
-        assert!((0..400_000).any(|_| self.node.is_idle_after_step()), "the work does not end");
-    }
+impl<'a> Deref for Host<'a> {
+    type Target = dyn Node + 'a;
 
+    fn deref(&self) -> &Self::Target {
+        &*self.node
+    }
+}
+
+impl DerefMut for Host<'_> {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        &mut *self.node
+    }
+}
+
+impl Host<'_> {
     /// Runs this many steps.
     pub fn steps(&mut self, steps: usize) {
         for _ in 0..steps {
             self.node.is_idle_after_step();
         }
-    }
-
-    fn word(&mut self, index: u16, program: u8) -> u32 {
-        let mut bytes = [0; 4];
-        self.node.read(Address::new(index, program), &mut bytes).expect("the object can be read");
-        u32::from_le_bytes(bytes)
-    }
-
-    /// 1F51h: 0 stopped, 3 there is none.
-    pub fn state(&mut self, program: u8) -> u32 {
-        self.word(0x1F51, program)
-    }
-
-    /// 1F56h.
-    pub fn identification(&mut self, program: u8) -> u32 {
-        self.word(0x1F56, program)
-    }
-
-    /// 1F57h.
-    pub fn status(&mut self, program: u8) -> u32 {
-        self.word(0x1F57, program)
-    }
-
-    /// Writes a command to 1F51h without waiting for its result.
-    ///
-    /// # Errors
-    /// The abort.
-    pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
-        self.node.write(Address::new(0x1F51, program), &[command])
     }
 
     /// A command, carried out; gives the status.
@@ -239,19 +221,6 @@ impl Host<'_> {
     /// The abort.
     pub fn go_on(&mut self, program: u8, data: &[u8], piece: usize) -> Result<(), AbortCode> {
         go_on(&mut *self.node, program, data, piece)
-    }
-
-    /// Ends a download without waiting for the result.
-    ///
-    /// # Errors
-    /// The abort.
-    pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
-        self.node.download_end(Address::new(0x1F50, program))
-    }
-
-    /// Ends the transfer like an SDO abort.
-    pub fn cancel(&mut self, program: u8) {
-        self.node.download_cancel(Address::new(0x1F50, program));
     }
 
     /// A download with all its work; returns the abort, if any, and the status.

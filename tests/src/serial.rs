@@ -15,48 +15,81 @@ use crate::bench::Bench;
 use crate::script::Wire;
 
 /// How long the board runs between two reads of the line.
-const LOOK: Span = Span::from_micros(100);
+const PERIOD: Span = Span::from_micros(100);
 /// Shorter than a character at 115 200 bit/s (87 us): a session that ends with a frame ends before
 /// the first character of the next frame is complete, so that this frame is still checked.
-const SHORT_LOOK: Span = Span::from_micros(50);
+const SHORT_PERIOD: Span = Span::from_micros(50);
 
-/// The host's end of the line of a board's UART. A read lets the board run.
-pub struct SerialLine<'b> {
-    /// The bench of the board.
-    pub bench: &'b mut Bench,
-    epoch: Instant,
-    timeout: Duration,
-    /// Received bytes that were not read yet.
-    come: VecDeque<u8>,
+/// A board with a serial line.
+pub trait Serial {
+    /// Its time.
+    fn time(&self) -> Duration;
+    /// Moves what it has sent to the end of `received`.
+    fn take_sent(&mut self, received: &mut VecDeque<u8>);
+    /// Runs for a moment.
+    ///
+    /// # Errors
+    /// The board does not run.
+    fn run(&mut self) -> io::Result<()>;
+    /// Receives these bytes; returns how many.
+    fn send(&mut self, bytes: &[u8]) -> usize;
 }
 
-impl<'b> SerialLine<'b> {
-    /// The line of the first board of a bench, which has power and has configured its UART.
-    pub fn new(bench: &'b mut Bench) -> Self {
-        Self { bench, epoch: Instant::now(), timeout: Duration::ZERO, come: VecDeque::new() }
+impl Serial for &mut Bench {
+    fn time(&self) -> Duration {
+        Duration::from_nanos(Bench::time(self).0 / 1000)
+    }
+
+    fn take_sent(&mut self, received: &mut VecDeque<u8>) {
+        received.extend(self.usart().take_sent().iter().map(|character| character.byte));
+    }
+
+    fn run(&mut self) -> io::Result<()> {
+        self.world.run_for(PERIOD);
+        Ok(())
+    }
+
+    fn send(&mut self, bytes: &[u8]) -> usize {
+        let now = Bench::time(self);
+        self.usart().receive(bytes, now)
     }
 }
 
-impl Read for SerialLine<'_> {
+/// The host's end of the line of a board. A read lets the board run.
+pub struct SerialLine<S> {
+    board: S,
+    epoch: Instant,
+    timeout: Duration,
+    /// Received bytes that were not read yet.
+    received: VecDeque<u8>,
+}
+
+impl<S: Serial> SerialLine<S> {
+    /// The line of a board, which has power and has configured its UART.
+    pub fn new(board: S) -> Self {
+        Self { board, epoch: Instant::now(), timeout: Duration::ZERO, received: VecDeque::new() }
+    }
+}
+
+impl<S: Serial> Read for SerialLine<S> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let deadline = self.now() + self.timeout;
+        let deadline = self.board.time() + self.timeout;
         loop {
-            self.come.extend(self.bench.usart().take_sent().iter().map(|character| character.byte));
-            if !self.come.is_empty() {
-                return self.come.read(buffer);
+            self.board.take_sent(&mut self.received);
+            if !self.received.is_empty() {
+                return self.received.read(buffer);
             }
-            if self.now() >= deadline {
+            if self.board.time() >= deadline {
                 return Err(ErrorKind::TimedOut.into());
             }
-            self.bench.world.run_for(LOOK);
+            self.board.run()?;
         }
     }
 }
 
-impl Write for SerialLine<'_> {
+impl<S: Serial> Write for SerialLine<S> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let now = self.bench.time();
-        Ok(self.bench.usart().receive(bytes, now))
+        Ok(self.board.send(bytes))
     }
 
     fn flush(&mut self) -> io::Result<()> {
@@ -64,14 +97,14 @@ impl Write for SerialLine<'_> {
     }
 }
 
-impl Line for SerialLine<'_> {
+impl<S: Serial> Line for SerialLine<S> {
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
         self.timeout = timeout;
         Ok(())
     }
 
     fn now(&self) -> Instant {
-        self.epoch + Duration::from_nanos(self.bench.time().0 / 1000)
+        self.epoch + self.board.time()
     }
 }
 
@@ -136,21 +169,18 @@ fn frame(start: Time, end: Time, line: &str) -> Option<Heard> {
 }
 
 impl Wire for TextBus {
-    fn time(&self) -> Time {
-        self.bench.time()
+    fn bench(&mut self) -> &mut Bench {
+        &mut self.bench
+    }
+
+    fn power_cycle(&mut self) {
+        self.bench.power_cycle();
+        // The rest of a line that was cut.
+        self.line.1.clear();
     }
 
     fn run_ms(&mut self, ms: u64) {
         self.run(Span::from_millis(ms));
-    }
-
-    fn power_off(&mut self) {
-        self.bench.power_off();
-        self.line.1.clear();
-    }
-
-    fn power_on(&mut self) {
-        self.bench.power_on();
     }
 
     fn send(&mut self, id: u16, data: &[u8]) {
@@ -190,7 +220,7 @@ impl Adapter for TextBus {
             if self.bench.time() >= deadline {
                 return Ok(None);
             }
-            self.run(SHORT_LOOK);
+            self.run(SHORT_PERIOD);
         }
     }
 

@@ -1,7 +1,6 @@
 //! The main scenarios on chips that seeds draw ([`Silicon`]). A scenario fails by a panic, as the tests
 //! do; what was drawn is printed before.
 
-use canopen::program::ProgramControl;
 use canopen::Address;
 use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
@@ -13,7 +12,7 @@ use kit::random::Random;
 use crate::bench::{Bench, NODE};
 use crate::firmware;
 
-const VERSION: Address = Address::new(0x100A, 0);
+const VERSION: u16 = 0x100A;
 /// Object 2000h of the tests' application: the way back.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 /// A branch to itself (ARMv7-M A7.7.12).
@@ -61,25 +60,17 @@ pub fn play_on(scenario: &Scenario, silicon: Silicon, seed: u64) {
     bench.assert_nothing_unmodelled();
 }
 
-fn power_cycle(bench: &mut Bench) {
-    bench.power_cycle();
-    bench.await_program(1000);
-    bench.events();
-}
-
 /// Download, start, way back, download again.
 fn main_job(bench: &mut Bench, way: u8) {
-    let options = FlashOptions::default();
-    flash(&mut bench.session(), firmware::blocks(firmware::APP_TEST), &options, &mut |_| {}).unwrap();
+    bench.update(firmware::APP_TEST);
     bench.session().write(REENTRY_PATH, &[way], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
     bench.events();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(100);
+    bench.call_back();
     assert!(bench.is_bootloader(NODE));
-    flash(&mut bench.session(), firmware::blocks(firmware::APP_V2), &options, &mut |_| {}).unwrap();
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    bench.update(firmware::APP_V2);
+    assert_eq!(bench.text(VERSION), "2.0.0");
     // A request for the bootloader, a start: no crash, and no watchdog that bites a program that lives.
-    power_cycle(bench);
+    bench.restart();
     assert!(!bench.is_bootloader(NODE));
 }
 
@@ -89,15 +80,14 @@ fn trial_dies(bench: &mut Bench, random: &mut Random) {
     bench.install(firmware::APP_V1);
     for _ in 0..=random.below(2) {
         bench.run_ms(random.below(400) as u64);
-        power_cycle(bench);
+        bench.restart();
     }
     assert!(!bench.is_bootloader(NODE), "it starts after the rescue window");
     // Three watchdog resets: it is given up, and starts on request.
     crashes_until_given_up(bench);
-    power_cycle(bench);
+    bench.restart();
     assert!(bench.is_bootloader(NODE), "a power-on alone does not try it again");
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
+    bench.start_program();
     assert!(!bench.is_bootloader(NODE));
 }
 
@@ -107,7 +97,7 @@ fn program_hangs(bench: &mut Bench) {
     bench.confirm_program();
     crashes_until_given_up(bench);
     bench.install(firmware::APP_V2);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(bench.text(VERSION), "2.0.0");
 }
 
 fn crashes_until_given_up(bench: &mut Bench) {
@@ -128,8 +118,7 @@ fn bootloader_hangs(bench: &mut Bench) {
     bench.run_ms(20);
     let lsi_hz = bench.machine().silicon().lsi_hz;
     let from = bench.time();
-    let idle = bench.machine().pc();
-    bench.machine().write_ram(idle, &HANG.to_le_bytes()).expect("idle sleeps in RAM");
+    bench.replace_idle(HANG);
     bench.run_ms(3_000);
     let events = bench.events();
     let [(at, Stop::Reset(ResetCause::IndependentWatchdog))] = events[..] else { panic!("{events:?}") };
@@ -151,9 +140,7 @@ fn cut_somewhere(bench: &mut Bench, random: &mut Random, operations: usize) {
 /// The power returns, if it was cut, and goes off once more if not.
 fn power_returns(bench: &mut Bench) {
     bench.machine().cut_power_at(None);
-    bench.power_off();
-    bench.run_ms(50);
-    bench.power_on();
+    bench.power_cycle();
 }
 
 /// After a cut in a store of a node-ID the device has the old one or the new one.
@@ -192,6 +179,6 @@ fn update_with_a_cut(bench: &mut Bench, random: &mut Random) {
     bench.run_ms(50);
     bench.install(firmware::APP_V2);
     bench.run_ms(500);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(bench.text(VERSION), "2.0.0");
     assert!(bench.time() < emulator::time::Time(0) + Span::from_millis(600_000), "it took minutes");
 }

@@ -85,11 +85,9 @@ pub fn measure(rate: BitRate, kib: u32) -> Measurement {
 
 /// A running board at this bit rate, and the bit rate in bit/s.
 fn board_at(rate: BitRate) -> (Bench, u32) {
-    let mut bench = Bench::new();
-    let bit_rate = change_over(&mut bench, rate);
-    bench.power_on();
+    let mut bench = Bench::at_rate(rate);
     bench.run_ms(50);
-    (bench, bit_rate)
+    (bench, rate.bits_per_second().expect("a rate that can be set"))
 }
 
 /// Sets another bit rate of a new board, and switches it off; returns the bit rate in bit/s.

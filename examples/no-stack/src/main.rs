@@ -13,7 +13,7 @@ use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{label, BitTiming, Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
 use cortex_m::peripheral::syst::SystClkSource;
-use cortex_m::peripheral::SCB;
+use cortex_m::peripheral::{SCB, SYST};
 use cortex_m_rt::{entry, exception, ExceptionFrame};
 use stm32f4xx_hal::can::CanExt;
 use stm32f4xx_hal::pac::{CorePeripherals, Peripherals, RCC};
@@ -49,12 +49,7 @@ fn main() -> ! {
     }
     let mut rcc = chip.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
     let can_clock = rcc.clocks.pclk1().raw();
-    let mut systick = core.SYST;
-    systick.set_clock_source(SystClkSource::Core);
-    systick.set_reload(rcc.clocks.sysclk().raw() / 1000 - 1);
-    systick.clear_current();
-    systick.enable_counter();
-    systick.enable_interrupt();
+    count_milliseconds(core.SYST, rcc.clocks.sysclk().raw());
 
     // The bootloader gives node-ID and bit rate, so that whoever talked to it goes on talking to
     // this program. The defaults hold where a debugger has started the program.
@@ -131,6 +126,15 @@ fn may_leave() -> bool {
 fn start_crystal(rcc: &RCC) -> bool {
     rcc.cr().modify(|_, w| w.hseon().set_bit());
     (0..PATIENCE).any(|_| rcc.cr().read().hserdy().bit_is_set())
+}
+
+/// Starts the system timer at this clock of the core, in Hz: its interrupt counts [`NOW`].
+fn count_milliseconds(mut systick: SYST, core_hz: u32) {
+    systick.set_clock_source(SystClkSource::Core);
+    systick.set_reload(core_hz / 1000 - 1);
+    systick.clear_current();
+    systick.enable_counter();
+    systick.enable_interrupt();
 }
 
 /// A filter for data frames with this identifier of 11 bits.

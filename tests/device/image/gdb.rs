@@ -127,14 +127,14 @@ impl Stub {
                 flash.base, flash.size, ram.base, ram.size
             );
         }
-        if let Some(rest) = text.strip_prefix("vFlashErase:") {
-            let [address, size] = numbers(rest)[..] else { return "E01".into() };
+        if let Some(arguments) = text.strip_prefix("vFlashErase:") {
+            let [address, size] = numbers(arguments)[..] else { return "E01".into() };
             self.memory.retain(|at, _| *at < address || *at >= address + size);
             return "OK".into();
         }
-        if let Some(rest) = text.strip_prefix("vFlashWrite:") {
+        if let Some(arguments) = text.strip_prefix("vFlashWrite:") {
             let data = packet.splitn(3, |byte| *byte == b':').nth(2).unwrap_or_default();
-            let Some(address) = numbers(rest).first().copied() else { return "E01".into() };
+            let Some(address) = numbers(arguments).first().copied() else { return "E01".into() };
             self.memory.extend((address..).zip(data.iter().copied()));
             return "OK".into();
         }

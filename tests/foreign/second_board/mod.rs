@@ -8,7 +8,8 @@ mod access;
 mod board;
 mod remote;
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::collections::VecDeque;
+use std::io;
 use std::time::{Duration, Instant};
 
 use board::Board;
@@ -17,7 +18,7 @@ use canopen::{Address, NodeId};
 use coboot_can::slcan::{Line, Slcan};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::serial::SerialLine;
+use coboot_tests::serial::{Serial, SerialLine};
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Firmware, Format};
@@ -25,48 +26,22 @@ use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as Chip;
 
-/// The host's end of the line of QEMU's board. A read lets the board run.
-struct QemuLine<'b> {
-    board: &'b mut Board,
-    epoch: Instant,
-    timeout: Duration,
-}
-
-impl Read for QemuLine<'_> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let deadline = self.board.time() + self.timeout;
-        loop {
-            let come = self.board.received();
-            if !come.is_empty() {
-                return come.read(buffer);
-            }
-            if self.board.time() >= deadline {
-                return Err(ErrorKind::TimedOut.into());
-            }
-            self.board.run_for_a_moment()?;
-        }
-    }
-}
-
-impl Write for QemuLine<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.board.send(bytes);
-        Ok(bytes.len())
+impl Serial for &mut Board {
+    fn time(&self) -> Duration {
+        Board::time(self)
     }
 
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
-impl Line for QemuLine<'_> {
-    fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
-        self.timeout = timeout;
-        Ok(())
+    fn take_sent(&mut self, received: &mut VecDeque<u8>) {
+        received.append(self.received());
     }
 
-    fn now(&self) -> Instant {
-        self.epoch + self.board.time()
+    fn run(&mut self) -> io::Result<()> {
+        self.run_for_a_moment()
+    }
+
+    fn send(&mut self, bytes: &[u8]) -> usize {
+        Board::send(self, bytes);
+        bytes.len()
     }
 }
 
@@ -129,7 +104,7 @@ fn an_update_leaves_the_same_flash_on_a_board_of_others() {
         board.run_for_a_moment().expect("QEMU");
         assert!(board.time() < Duration::from_secs(5), "no boot-up message");
     }
-    let theirs = update(QemuLine { board: &mut board, epoch, timeout: Duration::ZERO });
+    let theirs = update(SerialLine::new(&mut board));
     let flash = board.flash().expect("QEMU's flash");
 
     println!(

@@ -8,11 +8,12 @@ use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{provision, release, sealer, COUNTER};
+use coboot_tests::tools;
 use coflash_core::update::{flash, FlashOptions};
 use kit::hawkbit::{Action, File, Server};
 use serde_json::Value;
 
-use super::{check, given, script};
+use super::{check, script};
 
 const SEALED: u8 = 1;
 const IN_C: [u8; 2] = [2, 3];
@@ -82,7 +83,7 @@ impl Machine {
 
     /// Runs coflash on the bus, while the boards run.
     fn coflash(&mut self, words: &[&str]) -> Output {
-        let mut command = std::process::Command::new(given("COBOOT_COFLASH"));
+        let mut command = tools::coflash();
         command.args(["--bus", &self.endpoint.url()]).args(words).current_dir(&*self.folder);
         self.endpoint.run(&mut command)
     }
@@ -163,9 +164,9 @@ fn a_sealed_device_programs_in_c_and_in_rust_are_updated_by_command_line_page_an
     assert_eq!(machine.flash("old.cpk"), (Some(8), all_but(Some(8), "updated")));
     machine.endpoint.bench.world.power_on(last);
     machine.endpoint.bench.run_ms(200);
-    let mut rest = all_but(None, "had");
-    rest[7].1 = "updated".to_owned();
-    assert_eq!(machine.flash("old.cpk"), (Some(0), rest));
+    let mut outcomes = all_but(None, "had");
+    outcomes[7].1 = "updated".to_owned();
+    assert_eq!(machine.flash("old.cpk"), (Some(0), outcomes));
     machine.assert_has(&OLD);
 
     // The page of a service station.
@@ -202,7 +203,7 @@ fn a_sealed_device_programs_in_c_and_in_rust_are_updated_by_command_line_page_an
         "new-drive: updated: node 5",
         "new-drive: had it before: node 4, 6, 7, 8",
     ] {
-        assert!(details.lines().any(|its| its == line), "{line}: {details}");
+        assert!(details.lines().any(|of_agent| of_agent == line), "{line}: {details}");
     }
     machine.assert_has(&NEW);
     machine.endpoint.bench.assert_nothing_unmodelled();

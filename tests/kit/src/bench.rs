@@ -170,13 +170,9 @@ pub fn block_crc(bytes: &[u8]) -> u32 {
     crc32(bytes)
 }
 
-/// CRC-16/XMODEM from its definition (polynomial 1021h, start 0), bit by bit.
+/// CRC-16 in the words of blocks and programs.
 pub fn crc16(bytes: &[u8]) -> u32 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
-            (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
-        })
-    })
+    crate::crc::crc16(bytes).into()
 }
 
 pub fn last(program: &[u8]) -> Vec<u8> {

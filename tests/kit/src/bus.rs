@@ -168,9 +168,9 @@ impl<const SECOND: bool> Objects for DeviceOf<SECOND> {
     }
 
     fn upload_data(&mut self, _at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
-        let rest = &self.domain[offset as usize..];
-        let len = rest.len().min(buf.len());
-        buf[..len].copy_from_slice(&rest[..len]);
+        let remaining = &self.domain[offset as usize..];
+        let len = remaining.len().min(buf.len());
+        buf[..len].copy_from_slice(&remaining[..len]);
         Ok(len)
     }
 }

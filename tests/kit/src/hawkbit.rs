@@ -16,7 +16,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A request as it came.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct Request {
     pub method: String,
     pub path: String,
     pub token: Option<String>,
@@ -72,7 +72,7 @@ pub struct Action {
     /// `success` or `failure` when it is closed; `canceled`.
     pub result: Option<String>,
     /// All feedback on it: execution and details.
-    pub told: Vec<(String, Vec<String>)>,
+    pub feedback: Vec<(String, Vec<String>)>,
     /// The progress that was reported.
     pub progress: Vec<u64>,
     /// The reasons why a cancellation was rejected.
@@ -89,7 +89,7 @@ impl Action {
             active: true,
             cancelling: false,
             result: None,
-            told: Vec::new(),
+            feedback: Vec::new(),
             progress: Vec::new(),
             rejected: Vec::new(),
         }
@@ -97,7 +97,7 @@ impl Action {
 
     /// The details of all feedback with this execution.
     pub fn details(&self, execution: &str) -> String {
-        let of = self.told.iter().filter(|(told, _)| told == execution);
+        let of = self.feedback.iter().filter(|(of, _)| of == execution);
         of.flat_map(|(_, details)| details).cloned().collect::<Vec<_>>().join("\n")
     }
 }
@@ -132,7 +132,7 @@ pub enum Fault {
 #[derive(Debug, Default)]
 pub struct State {
     pub targets: BTreeMap<String, Target>,
-    pub seen: Vec<Seen>,
+    pub seen: Vec<Request>,
     /// For requests whose path contains the text: how often, and what.
     pub faults: Vec<(String, usize, Fault)>,
     pub url: String,
@@ -197,7 +197,7 @@ impl Server {
         assert!(!timeout.timed_out(), "{what} never comes: {:?}", guard.targets);
     }
 
-    pub fn seen(&self, path: &str) -> Vec<Seen> {
+    pub fn seen(&self, path: &str) -> Vec<Request> {
         self.state().seen.iter().filter(|seen| seen.path.contains(path)).cloned().collect()
     }
 }
@@ -226,7 +226,7 @@ fn serve(stream: &TcpStream, shared: &(Mutex<State>, Condvar)) -> std::io::Resul
     let length = headers.get("content-length").and_then(|length| length.parse().ok()).unwrap_or(0);
     let mut body = vec![0; length];
     reader.read_exact(&mut body)?;
-    let seen = Seen {
+    let seen = Request {
         method: method.to_string(),
         path: path.to_string(),
         token: headers.get("authorization").cloned(),
@@ -299,7 +299,7 @@ fn send(mut stream: &TcpStream, mut answer: Answer, fault: Option<Fault>) -> std
     stream.write_all(&answer.body[..cut.unwrap_or(answer.body.len()).min(answer.body.len())])
 }
 
-fn answer(state: &mut State, seen: &Seen) -> Answer {
+fn answer(state: &mut State, seen: &Request) -> Answer {
     let path = seen.path.split('?').next().unwrap();
     let url = state.url.clone();
     if let Some(name) = path.strip_prefix("/files/") {
@@ -311,7 +311,9 @@ fn answer(state: &mut State, seen: &Seen) -> Answer {
         };
     }
     let parts: Vec<&str> = path.trim_start_matches('/').split('/').collect();
-    let ["DEFAULT", "controller", "v1", id, rest @ ..] = parts.as_slice() else { return Answer::status(404) };
+    let ["DEFAULT", "controller", "v1", id, resource @ ..] = parts.as_slice() else {
+        return Answer::status(404);
+    };
     let right = [format!("TargetToken t-{id}"), "GatewayToken g".to_string()];
     if !seen.token.as_ref().is_some_and(|token| right.contains(token)) {
         return Answer::status(401);
@@ -319,17 +321,16 @@ fn answer(state: &mut State, seen: &Seen) -> Answer {
     let root = format!("{url}/DEFAULT/controller/v1/{id}");
     let Some(target) = state.targets.get_mut(*id) else { return Answer::status(404) };
     let action = target.action.as_mut();
-    match (seen.method.as_str(), rest) {
+    match (seen.method.as_str(), resource) {
         ("GET", []) => {
             let mut links = json!({});
             if let Some(action) = action.filter(|action| action.active) {
-                let number = action.id;
-                if action.cancelling {
-                    links["cancelAction"] = json!({ "href": format!("{root}/cancelAction/{number}") });
+                let (kind, query) = if action.cancelling {
+                    ("cancelAction", "")
                 } else {
-                    let href = format!("{root}/deploymentBase/{number}?c=-2127183556");
-                    links["deploymentBase"] = json!({ "href": href });
-                }
+                    ("deploymentBase", "?c=-2127183556")
+                };
+                links[kind] = json!({ "href": format!("{root}/{kind}/{}{query}", action.id) });
             }
             if target.wants_attributes {
                 links["configData"] = json!({ "href": format!("{root}/configData") });
@@ -344,26 +345,7 @@ fn answer(state: &mut State, seen: &Seen) -> Answer {
             Answer::status(200)
         }
         ("GET", ["deploymentBase", number]) => match action.filter(|a| a.id.to_string() == *number) {
-            Some(action) if action.active && !action.cancelling => {
-                let file = &action.file;
-                let mut hashes = json!({ "md5": "0", "sha1": "0" });
-                if let Some(sha256) = &file.sha256 {
-                    hashes["sha256"] = sha256.as_str().into();
-                }
-                let own = format!("{root}/softwaremodules/1/artifacts/{}", file.name);
-                let href = file.link.clone().unwrap_or(own);
-                let mut deployment = json!({
-                    "download": "forced", "update": action.update,
-                    "chunks": [{ "part": "bApp", "version": "1.0", "name": "program", "artifacts": [{
-                        "filename": file.name, "hashes": hashes, "size": file.size,
-                        "_links": { "download-http": { "href": href } },
-                    }]}],
-                });
-                if let Some(window) = action.window {
-                    deployment["maintenanceWindow"] = window.into();
-                }
-                Answer::json(&json!({ "id": number, "deployment": deployment }))
-            }
+            Some(action) if action.active && !action.cancelling => deployment(action, &root),
             _ => Answer::status(404),
         },
         ("GET", ["softwaremodules", "1", "artifacts", name]) => match action {
@@ -380,45 +362,73 @@ fn answer(state: &mut State, seen: &Seen) -> Answer {
             let Some(action) = action.filter(|action| action.id.to_string() == *number) else {
                 return Answer::status(404);
             };
-            let status = &seen.body["status"];
-            let (Some(execution), Some(finished)) =
-                (status["execution"].as_str(), status["result"]["finished"].as_str())
-            else {
-                return Answer::status(400);
-            };
-            if !action.active {
-                return Answer::status(410);
-            }
-            let details = status["details"].as_array().into_iter().flatten();
-            let details: Vec<String> = details.filter_map(Value::as_str).map(String::from).collect();
-            match (*channel, execution) {
-                ("cancelAction", "rejected") => {
-                    action.cancelling = false;
-                    action.rejected.extend(details);
-                }
-                ("cancelAction", "closed") => {
-                    action.active = false;
-                    action.result = Some("canceled".to_string());
-                }
-                (_, "closed") => {
-                    action.active = false;
-                    action.result = Some(finished.to_string());
-                    action.told.push((execution.to_string(), details));
-                    target.wants_attributes = finished == "success";
-                }
-                _ => {
-                    action.progress.extend(status["result"]["progress"]["cnt"].as_u64());
-                    action.told.push((execution.to_string(), details));
-                }
-            }
-            Answer::status(200)
+            let (answer, wants_attributes) = feedback(action, channel, &seen.body["status"]);
+            target.wants_attributes = wants_attributes.unwrap_or(target.wants_attributes);
+            answer
         }
         _ => Answer::status(405),
     }
 }
 
+/// What a device is to install.
+fn deployment(action: &Action, root: &str) -> Answer {
+    let file = &action.file;
+    let mut hashes = json!({ "md5": "0", "sha1": "0" });
+    if let Some(sha256) = &file.sha256 {
+        hashes["sha256"] = sha256.as_str().into();
+    }
+    let own = format!("{root}/softwaremodules/1/artifacts/{}", file.name);
+    let href = file.link.clone().unwrap_or(own);
+    let mut deployment = json!({
+        "download": "forced", "update": action.update,
+        "chunks": [{ "part": "bApp", "version": "1.0", "name": "program", "artifacts": [{
+            "filename": file.name, "hashes": hashes, "size": file.size,
+            "_links": { "download-http": { "href": href } },
+        }]}],
+    });
+    if let Some(window) = action.window {
+        deployment["maintenanceWindow"] = window.into();
+    }
+    Answer::json(&json!({ "id": action.id.to_string(), "deployment": deployment }))
+}
+
+/// Feedback of a device; with whether the server asks for its attributes now, if that changes.
+fn feedback(action: &mut Action, channel: &str, status: &Value) -> (Answer, Option<bool>) {
+    let (Some(execution), Some(finished)) =
+        (status["execution"].as_str(), status["result"]["finished"].as_str())
+    else {
+        return (Answer::status(400), None);
+    };
+    if !action.active {
+        return (Answer::status(410), None);
+    }
+    let details = status["details"].as_array().into_iter().flatten();
+    let details: Vec<String> = details.filter_map(Value::as_str).map(String::from).collect();
+    match (channel, execution) {
+        ("cancelAction", "rejected") => {
+            action.cancelling = false;
+            action.rejected.extend(details);
+        }
+        ("cancelAction", "closed") => {
+            action.active = false;
+            action.result = Some("canceled".to_string());
+        }
+        (_, "closed") => {
+            action.active = false;
+            action.result = Some(finished.to_string());
+            action.feedback.push((execution.to_string(), details));
+            return (Answer::status(200), Some(finished == "success"));
+        }
+        _ => {
+            action.progress.extend(status["result"]["progress"]["cnt"].as_u64());
+            action.feedback.push((execution.to_string(), details));
+        }
+    }
+    (Answer::status(200), None)
+}
+
 /// A file, or the part of it that is asked for.
-fn part(file: &File, seen: &Seen) -> Answer {
+fn part(file: &File, seen: &Request) -> Answer {
     let mut headers = Vec::new();
     if file.ranges {
         headers.push(("Accept-Ranges".to_string(), "bytes".to_string()));

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `random` | random numbers by a seed |
 //! | `folder` | a folder of a test's own |
+//! | `crc` | CRC-32 and CRC-16 from their definitions |
 //! | `ihex` | Intel HEX as tools write it |
 //! | `pages` | the commands on the pages of the documentation |
 //! | `fake` | feature `fake`: devices with virtual time, as adapters and behind a socketcand server |
@@ -29,6 +30,8 @@ pub mod boot;
 #[cfg(feature = "bus")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod bus;
+#[allow(missing_docs, reason = "names say it")]
+pub mod crc;
 #[cfg(feature = "boot")]
 pub mod driver;
 #[cfg(feature = "fake")]

@@ -13,6 +13,8 @@ use boot_core::flash::{Flash, FlashFault, Operation as Started};
 use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
 use shared_abi::layout::Layout;
 
+use crate::random::Random;
+
 /// The F407 with sectors a 64th of their size: the same shape, and cheap to erase in a model.
 pub static CHIP: Geometry = Geometry {
     chip: "small-f407",
@@ -218,12 +220,12 @@ impl ModelFlash {
     /// Does a part of the operation, selected by `seed`. An odd seed of a torn erase ends it in the
     /// middle of the sector; an odd seed of an unstable operation does everything except one bit.
     fn tear(&mut self, operation: Operation, seed: u64, unstable: bool) {
-        let mut state = seed.wrapping_add(u64::from(self.operations) << 8);
+        let mut random = Random(seed.wrapping_add(u64::from(self.operations) << 8));
         let odd = seed & 1 == 1;
         let effect = self.effect(operation);
         if odd && unstable {
             let changed: Vec<_> = effect.iter().filter(|(at, becomes)| self.cells[*at] != *becomes).collect();
-            if let Some((at, becomes)) = changed.get(splitmix64(&mut state) as usize % changed.len().max(1)) {
+            if let Some((at, becomes)) = changed.get(random.next() as usize % changed.len().max(1)) {
                 let bits = self.cells[*at] ^ becomes;
                 let one = 1 << bits.trailing_zeros();
                 let at = *at;
@@ -232,28 +234,20 @@ impl ModelFlash {
             }
             return;
         }
-        let middle = splitmix64(&mut state) as usize % effect.len();
+        let middle = random.next() as usize % effect.len();
         for (i, (at, becomes)) in effect.into_iter().enumerate() {
             let before = self.cells[at];
             let changed = match operation {
                 Operation::Erase(_) if odd => (before ^ becomes) & if i < middle { 0xFF } else { 0 },
-                _ => (before ^ becomes) & splitmix64(&mut state) as u8,
+                _ => (before ^ becomes) & random.next() as u8,
             };
             self.cells[at] = before ^ changed;
-            let between = (before ^ becomes) & splitmix64(&mut state) as u8;
+            let between = (before ^ becomes) & random.next() as u8;
             if unstable && between != 0 {
                 *self.unstable.entry(at).or_default() |= between;
             }
         }
     }
-}
-
-/// The next number: a different pattern for every state.
-fn splitmix64(state: &mut u64) -> u64 {
-    *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    let z = (*state ^ *state >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ z >> 31
 }
 
 impl Flash for ModelFlash {
@@ -279,9 +273,9 @@ impl Flash for ModelFlash {
             let at = self.index(address);
             *byte = self.cells[at];
             if let Some(bits) = self.unstable.get(&at) {
-                let mut state = self.noise.get();
-                *byte ^= bits & splitmix64(&mut state) as u8;
-                self.noise.set(state);
+                let mut random = Random(self.noise.get());
+                *byte ^= bits & random.next() as u8;
+                self.noise.set(random.0);
             }
         }
     }

@@ -148,11 +148,11 @@ fn words(line: &str) -> Vec<String> {
 #[must_use]
 pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
     match words {
-        [name, rest @ ..] if name == program => Some(rest),
-        [cargo, run, option, name, dashes, rest @ ..]
+        [name, arguments @ ..] if name == program => Some(arguments),
+        [cargo, run, option, name, dashes, arguments @ ..]
             if [cargo, run, option, dashes] == ["cargo", "run", "-p", "--"] && name == program =>
         {
-            Some(rest)
+            Some(arguments)
         }
         _ => None,
     }

@@ -3,6 +3,8 @@
 //! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
 //! [`boot`](crate::boot) and [`Rig::stored`].
 
+use std::ops::{Deref, DerefMut};
+
 use boot_core::bootloader::{
     entries, entry_count, Bootloader, Choices, Config, Everything, Extras, PasswordObject,
 };
@@ -25,6 +27,7 @@ use shared_abi::renewal::word;
 use shared_abi::warm_start::BootRequest;
 
 use crate::boot::{leaked, Boot};
+pub use crate::crc::{crc32, Crc};
 use crate::ihex::{record, END_OF_FILE};
 use crate::model::{Chip, ModelFlash, ONE_PROGRAM, TWO_PROGRAMS};
 use crate::renewal::{self, loads};
@@ -257,6 +260,55 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Node for Bootlo
     }
 }
 
+/// The actions of a host.
+impl dyn Node + '_ {
+    /// Runs until there is no work.
+    pub fn settle(&mut self) {
+        assert!(self.settles(), "the work does not end");
+    }
+
+    /// The same; returns whether the work ended.
+    pub fn settles(&mut self) -> bool {
+        (0..400_000).any(|_| self.is_idle_after_step())
+    }
+
+    pub fn word(&mut self, index: u16, sub: u8) -> u32 {
+        let mut bytes = [0; 4];
+        self.read(Address::new(index, sub), &mut bytes).expect("the object can be read");
+        u32::from_le_bytes(bytes)
+    }
+
+    /// 1F51h: 0 stopped, 3 no program.
+    pub fn state(&mut self, program: u8) -> u32 {
+        self.word(0x1F51, program)
+    }
+
+    /// 1F56h.
+    pub fn identification(&mut self, program: u8) -> u32 {
+        self.word(0x1F56, program)
+    }
+
+    /// 1F57h.
+    pub fn status(&mut self, program: u8) -> u32 {
+        self.word(0x1F57, program)
+    }
+
+    /// Writes a command to 1F51h without waiting for its result.
+    pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
+        self.write(Address::new(0x1F51, program), &[command])
+    }
+
+    /// Ends a download without waiting for its result.
+    pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
+        self.download_end(Address::new(0x1F50, program))
+    }
+
+    /// Ends the transfer like an SDO abort.
+    pub fn cancel(&mut self, program: u8) {
+        self.download_cancel(Address::new(0x1F50, program));
+    }
+}
+
 /// Sends more bytes of a transfer to 1F50h in pieces of this size, and waits for room. An error ends the transfer,
 /// as in the SDO server.
 pub fn go_on(
@@ -298,6 +350,20 @@ pub struct Rig {
     pub chip: Chip,
     pub node: Box<dyn Node>,
     buffer: usize,
+}
+
+impl Deref for Rig {
+    type Target = dyn Node;
+
+    fn deref(&self) -> &Self::Target {
+        &*self.node
+    }
+}
+
+impl DerefMut for Rig {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        &mut *self.node
+    }
 }
 
 pub const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
@@ -375,46 +441,10 @@ impl Rig {
         self.node = Self::boot(self.setup, &self.chip, self.buffer, request);
     }
 
-    /// Runs until there is no work.
-    pub fn settle(&mut self) {
-        assert!(self.settles(), "the work does not end");
-    }
-
-    /// The same; returns whether the work ended.
-    pub fn settles(&mut self) -> bool {
-        (0..200_000).any(|_| self.node.is_idle_after_step())
-    }
-
     pub fn steps(&mut self, steps: u32) {
         for _ in 0..steps {
             self.node.is_idle_after_step();
         }
-    }
-
-    pub fn word(&mut self, index: u16, sub: u8) -> u32 {
-        let mut bytes = [0; 4];
-        self.node.read(Address::new(index, sub), &mut bytes).expect("the object can be read");
-        u32::from_le_bytes(bytes)
-    }
-
-    /// 1F51h: 0 stopped, 3 no program.
-    pub fn state(&mut self, program: u8) -> u32 {
-        self.word(0x1F51, program)
-    }
-
-    /// 1F56h.
-    pub fn identification(&mut self, program: u8) -> u32 {
-        self.word(0x1F56, program)
-    }
-
-    /// 1F57h.
-    pub fn status(&mut self, program: u8) -> u32 {
-        self.word(0x1F57, program)
-    }
-
-    /// 1F51h.
-    pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
-        self.node.write(Address::new(0x1F51, program), &[command])
     }
 
     /// The right password, if there is one.
@@ -431,18 +461,10 @@ impl Rig {
         go_on(&mut *self.node, program, data, 7)
     }
 
-    pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
-        self.node.download_end(Address::new(0x1F50, program))
-    }
-
     /// A whole download, without waiting for the remaining work.
     pub fn send(&mut self, program: u8, data: &[u8]) -> Result<(), AbortCode> {
         self.begin(program, Some(data.len() as u32), data)?;
         self.end(program)
-    }
-
-    pub fn cancel(&mut self, program: u8) {
-        self.node.download_cancel(Address::new(0x1F50, program));
     }
 
     /// Password or CLEAR, and a program in one download, with all work; a resulting request to
@@ -494,12 +516,12 @@ impl Rig {
     /// The length of the part of a program's flash, from its start, with the CRC in 1F56h; `None`
     /// if no length matches: then the record is wrong.
     pub fn size_by_crc(&mut self, program: u8) -> Option<u32> {
-        let told = self.identification(program);
+        let identification = self.identification(program);
         let cells = self.cells(program);
         let mut crc = Crc::new();
         (1..).zip(&cells).find_map(|(len, byte)| {
             crc.push(*byte);
-            (crc.value() == told).then_some(len)
+            (crc.value() == identification).then_some(len)
         })
     }
 
@@ -507,47 +529,6 @@ impl Rig {
     pub fn is_true(&mut self, program: u8) -> bool {
         self.state(program) == 3 || self.size_by_crc(program).is_some()
     }
-}
-
-// --- CRC-32
-
-/// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), a byte at a time.
-pub struct Crc(u32);
-
-const TABLE: [u32; 256] = {
-    let mut table = [0; 256];
-    let mut byte = 0;
-    while byte < 256 {
-        let mut crc = byte as u32;
-        let mut bit = 0;
-        while bit < 8 {
-            crc = if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 };
-            bit += 1;
-        }
-        table[byte] = crc;
-        byte += 1;
-    }
-    table
-};
-
-impl Crc {
-    pub fn new() -> Self {
-        Self(u32::MAX)
-    }
-
-    pub fn push(&mut self, byte: u8) {
-        self.0 = TABLE[usize::from(self.0 as u8 ^ byte)] ^ self.0 >> 8;
-    }
-
-    pub fn value(&self) -> u32 {
-        !self.0
-    }
-}
-
-pub fn crc32(bytes: &[u8]) -> u32 {
-    let mut crc = Crc::new();
-    bytes.iter().for_each(|byte| crc.push(*byte));
-    crc.value()
 }
 
 // --- programs and how they are sent

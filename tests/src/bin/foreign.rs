@@ -26,30 +26,18 @@ struct Check {
     play: fn(&mut Desk) -> Result<String, String>,
 }
 
-/// Most of them have this one.
-const K500: u32 = 500_000;
+/// What most of them have.
+const AT_CAN1: Check = Check { name: "", chip: &STM32F407VG, can: 0, bit_rate: 500_000, play: hal_can_send };
 
 /// All of them, with a crystal of 8 MHz.
 const CHECKS: [Check; 7] = [
-    Check {
-        name: "katapult",
-        chip: &STM32F407VG,
-        can: 0,
-        bit_rate: K500,
-        play: |desk| desk.unassigned(KATAPULT).map(uuid),
-    },
-    Check { name: "klipper", chip: &STM32F407VG, can: 0, bit_rate: K500, play: klipper },
-    Check {
-        name: "klipper-katapult",
-        chip: &STM32F407VG,
-        can: 0,
-        bit_rate: K500,
-        play: klipper_is_called_back,
-    },
-    Check { name: "chibios", chip: &STM32F407VG, can: 1, bit_rate: K500, play: chibios },
-    Check { name: "canopennode", chip: &STM32F407VG, can: 1, bit_rate: 125_000, play: canopennode },
-    Check { name: "openblt", chip: &STM32F405RG, can: 0, bit_rate: K500, play: openblt },
-    Check { name: "stm32f4xx-hal", chip: &STM32F407VG, can: 0, bit_rate: K500, play: hal_can_send },
+    Check { name: "katapult", play: |desk| desk.unassigned(KATAPULT).map(uuid), ..AT_CAN1 },
+    Check { name: "klipper", play: klipper, ..AT_CAN1 },
+    Check { name: "klipper-katapult", play: klipper_is_called_back, ..AT_CAN1 },
+    Check { name: "chibios", can: 1, play: chibios, ..AT_CAN1 },
+    Check { name: "canopennode", can: 1, bit_rate: 125_000, play: canopennode, ..AT_CAN1 },
+    Check { name: "openblt", chip: &STM32F405RG, play: openblt, ..AT_CAN1 },
+    Check { name: "stm32f4xx-hal", play: hal_can_send, ..AT_CAN1 },
 ];
 
 /// Klipper's protocol on CAN: the administrator asks, and a node without a number answers with its UUID and
@@ -99,7 +87,7 @@ impl Desk {
         self.send(ADMIN, &[0]);
         let answer = self.expect(ADMIN_ANSWER, 200)?;
         match answer[..] {
-            [0x20, a, b, c, d, e, f, told] if told == kind => Ok([a, b, c, d, e, f]),
+            [0x20, a, b, c, d, e, f, of_kind] if of_kind == kind => Ok([a, b, c, d, e, f]),
             _ => Err(format!("the answer to the query is {answer:02X?}")),
         }
     }
@@ -186,12 +174,12 @@ fn run(check: &Check, files: &str) -> Result<String, String> {
     let read = |file: &str| std::fs::read(file).map_err(|error| format!("{file}: {error}"));
     let images = files.split(',').map(read).collect::<Result<Vec<_>, _>>()?;
     let mut desk = Desk::new(check, &images)?;
-    let told = (check.play)(&mut desk);
+    let outcome = (check.play)(&mut desk);
     let machine = desk.world.machine(desk.board);
     for report in machine.reports() {
         println!("  {}: {report}", check.name);
     }
-    told.map(|what| format!("{what} ({} s after power-on)", desk.world.now()))
+    outcome.map(|what| format!("{what} ({} s after power-on)", desk.world.now()))
 }
 
 fn main() -> ExitCode {

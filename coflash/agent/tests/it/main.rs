@@ -133,7 +133,7 @@ fn a_deployment_reaches_the_device_and_its_result_the_server() {
     assert_eq!(fake.given(), [(ID.to_string(), crc())]);
     let action = server.action(ID);
     assert_eq!(action.result.as_deref(), Some("success"));
-    let executions: Vec<&str> = action.told.iter().map(|(execution, _)| execution.as_str()).collect();
+    let executions: Vec<&str> = action.feedback.iter().map(|(execution, _)| execution.as_str()).collect();
     assert_eq!(executions.first(), Some(&"download"));
     assert_eq!(executions.last(), Some(&"closed"));
     assert_eq!(action.details("closed"), "done in 1.0 s");
@@ -372,7 +372,7 @@ fn what_was_interrupted_goes_on_after_a_restart() {
     let (ended, said) = once(&server, &folder, &fake, &[ID]);
     assert!(said.contains("was interrupted"), "{said}");
     assert_eq!((ended.updated, fake.given().len()), (1, 2), "{said}");
-    assert!(server.action(ID).told.iter().any(|(execution, _)| execution == "resumed"));
+    assert!(server.action(ID).feedback.iter().any(|(execution, _)| execution == "resumed"));
     assert_eq!(server.action(ID).result.as_deref(), Some("success"));
 }
 

@@ -14,6 +14,7 @@ mod serve;
 pub mod vault;
 
 pub use self::serve::serve;
+pub use crate::crc::crc16;
 
 /// In place of the abort code for an object: no answer at all.
 pub const SILENT: u32 = 0;
@@ -382,36 +383,8 @@ impl Fake {
         let at = (u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3]);
         let word = u32::from_le_bytes(bytes[4..].try_into().unwrap());
         match bytes[0] {
-            // Initiate upload.
-            0x40 => {
-                self.log.push(format!("read {:04X}/{}", at.0, at.1));
-                match self.value(at) {
-                    Ok(value) if value.len() <= 4 => {
-                        let mut word = [0; 4];
-                        word[..value.len()].copy_from_slice(&value);
-                        let command = 0x43 | ((4 - value.len() as u8) << 2);
-                        self.answer(initiate(command, at, u32::from_le_bytes(word)));
-                    }
-                    Ok(value) => {
-                        self.answer(initiate(0x41, at, value.len() as u32));
-                        self.upload = Some((value, 0));
-                    }
-                    Err(SILENT) => {}
-                    Err(code) => self.abort(at, code),
-                }
-            }
-            // Upload segment.
-            command @ (0x60 | 0x70) => {
-                let Some((value, toggle)) = &mut self.upload else { return self.abort((0, 0), 0x0504_0001) };
-                assert_eq!(command & 0x10, *toggle);
-                let chunk: Vec<u8> = value.drain(..value.len().min(7)).collect();
-                let last = u8::from(value.is_empty());
-                let mut data = [0; 8];
-                data[0] = *toggle | (7 - chunk.len() as u8) << 1 | last;
-                data[1..=chunk.len()].copy_from_slice(&chunk);
-                *toggle ^= 0x10;
-                self.answer(data);
-            }
+            0x40 => self.initiate_upload(at),
+            command @ (0x60 | 0x70) => self.upload_segment(command),
             // Initiate download, segmented with size.
             0x21 => {
                 self.download =
@@ -427,48 +400,11 @@ impl Fake {
                 let len = 4 - usize::from(command >> 2 & 3);
                 self.write(at, bytes[4..4 + len].to_vec(), initiate(0x60, at, 0));
             }
-            // Download segment.
-            command if command & 0xE0 == 0 => {
-                let Some(download) = &mut self.download else { return self.abort((0, 0), 0x0504_0001) };
-                assert_eq!(command & 0x10, download.toggle);
-                let len = 7 - usize::from(command >> 1 & 7);
-                download.data.extend_from_slice(&bytes[1..=len]);
-                let answer = [0x20 | download.toggle, 0, 0, 0, 0, 0, 0, 0];
-                download.toggle ^= 0x10;
-                if command & 1 == 0 {
-                    return self.answer(answer);
-                }
-                let Some(download) = self.download.take() else { return };
-                assert_eq!(download.data.len(), download.size);
-                self.write(download.at, download.data, answer);
-            }
+            command if command & 0xE0 == 0 => self.download_segment(bytes),
             // Initiate block download with size and CRC.
-            0xC6 => {
-                self.block_downloads += 1;
-                match self.knows_blocks {
-                    Blocks::Known(_) if at.0 == 0x1F50 && self.busy() => {
-                        self.status = 0x86;
-                        self.abort(at, 0x0800_0022);
-                    }
-                    Blocks::Known(_) if at.0 == 0x1F50 && word as usize > self.room => {
-                        self.status = 0x04;
-                        self.abort(at, 0x0607_0012);
-                    }
-                    Blocks::Known(blksize) => {
-                        let data = Vec::new();
-                        let sub_block = Some((0, false));
-                        self.download =
-                            Some(Download { at, size: word as usize, data, toggle: 0, sub_block });
-                        self.answer(initiate(0xA4, at, blksize.into()));
-                    }
-                    Blocks::Refused(code) => self.abort(at, code),
-                    Blocks::Ignored => {}
-                }
-            }
+            0xC6 => self.initiate_block_download(at, word as usize),
             // Initiate block upload: a server may answer it without blocks (CiA 301, 7.2.4.3.15).
-            0xA4 if matches!(self.knows_blocks, Blocks::Known(_)) => {
-                self.request([0x40, bytes[1], bytes[2], bytes[3], 0, 0, 0, 0]);
-            }
+            0xA4 if matches!(self.knows_blocks, Blocks::Known(_)) => self.initiate_upload(at),
             0xA4 => self.abort(at, 0x0504_0001),
             0x80 => {
                 self.log.push(format!("abort {word:08X}"));
@@ -477,6 +413,73 @@ impl Fake {
             // Segments of an ended transfer.
             _ if self.refuses_segment.is_some() => self.abort((0, 0), 0x0504_0001),
             other => panic!("unexpected command {other:02X}"),
+        }
+    }
+
+    fn initiate_upload(&mut self, at: (u16, u8)) {
+        self.log.push(format!("read {:04X}/{}", at.0, at.1));
+        match self.value(at) {
+            Ok(value) if value.len() <= 4 => {
+                let mut word = [0; 4];
+                word[..value.len()].copy_from_slice(&value);
+                let command = 0x43 | ((4 - value.len() as u8) << 2);
+                self.answer(initiate(command, at, u32::from_le_bytes(word)));
+            }
+            Ok(value) => {
+                self.answer(initiate(0x41, at, value.len() as u32));
+                self.upload = Some((value, 0));
+            }
+            Err(SILENT) => {}
+            Err(code) => self.abort(at, code),
+        }
+    }
+
+    fn upload_segment(&mut self, command: u8) {
+        let Some((value, toggle)) = &mut self.upload else { return self.abort((0, 0), 0x0504_0001) };
+        assert_eq!(command & 0x10, *toggle);
+        let chunk: Vec<u8> = value.drain(..value.len().min(7)).collect();
+        let last = u8::from(value.is_empty());
+        let mut data = [0; 8];
+        data[0] = *toggle | (7 - chunk.len() as u8) << 1 | last;
+        data[1..=chunk.len()].copy_from_slice(&chunk);
+        *toggle ^= 0x10;
+        self.answer(data);
+    }
+
+    fn download_segment(&mut self, bytes: [u8; 8]) {
+        let command = bytes[0];
+        let Some(download) = &mut self.download else { return self.abort((0, 0), 0x0504_0001) };
+        assert_eq!(command & 0x10, download.toggle);
+        let len = 7 - usize::from(command >> 1 & 7);
+        download.data.extend_from_slice(&bytes[1..=len]);
+        let answer = [0x20 | download.toggle, 0, 0, 0, 0, 0, 0, 0];
+        download.toggle ^= 0x10;
+        if command & 1 == 0 {
+            return self.answer(answer);
+        }
+        let Some(download) = self.download.take() else { return };
+        assert_eq!(download.data.len(), download.size);
+        self.write(download.at, download.data, answer);
+    }
+
+    fn initiate_block_download(&mut self, at: (u16, u8), size: usize) {
+        self.block_downloads += 1;
+        match self.knows_blocks {
+            Blocks::Known(_) if at.0 == 0x1F50 && self.busy() => {
+                self.status = 0x86;
+                self.abort(at, 0x0800_0022);
+            }
+            Blocks::Known(_) if at.0 == 0x1F50 && size > self.room => {
+                self.status = 0x04;
+                self.abort(at, 0x0607_0012);
+            }
+            Blocks::Known(blksize) => {
+                let sub_block = Some((0, false));
+                self.download = Some(Download { at, size, data: Vec::new(), toggle: 0, sub_block });
+                self.answer(initiate(0xA4, at, blksize.into()));
+            }
+            Blocks::Refused(code) => self.abort(at, code),
+            Blocks::Ignored => {}
         }
     }
 
@@ -602,22 +605,6 @@ impl Fake {
             other => panic!("unexpected write {other:X?}"),
         }
     }
-}
-
-/// CRC of a block transfer: polynomial 1021h, start value 0 (CiA 301, 7.2.4.3.16), bit by bit.
-pub fn crc16(data: &[u8]) -> u16 {
-    data.iter().fold(0, |crc, byte| {
-        (0..8).fold(
-            crc ^ u16::from(*byte) << 8,
-            |crc, _| {
-                if crc & 0x8000 != 0 {
-                    crc << 1 ^ 0x1021
-                } else {
-                    crc << 1
-                }
-            },
-        )
-    })
 }
 
 /// An initiate frame or an abort: command, index, sub-index, 32 bits.

@@ -31,7 +31,7 @@ pub fn image(version: u32) -> Vec<u8> {
         bytes.extend(u32::to_le_bytes(word));
     }
     bytes.extend(0..=255_u8);
-    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&bytes[8..]);
+    let crc = crate::crc::crc32(&bytes[8..]);
     bytes[4..8].copy_from_slice(&crc.to_le_bytes());
     bytes
 }

@@ -74,8 +74,8 @@ fn demo(trace: Option<&str>, story: Story) -> Outcome<()> {
 
     match story {
         Story::MainJob => main_job(&mut bench)?,
-        Story::Sealed => sealed::tell(&mut bench)?,
-        Story::Renewal => renew::tell(&mut bench)?,
+        Story::Sealed => sealed::run(&mut bench)?,
+        Story::Renewal => renew::run(&mut bench)?,
     }
 
     let counters = bench.machine().counters();

@@ -15,7 +15,7 @@ use emulator::machine::{Cut, FlashCut};
 use crate::steps::{chapter, convert, install, introduce, print_line, Outcome};
 
 /// A bootloader is exchanged over CAN; a broken one ends by itself; the power fails.
-pub fn tell(bench: &mut Bench) -> Outcome<()> {
+pub fn run(bench: &mut Bench) -> Outcome<()> {
     chapter("A board runs version 1 of its program");
     bench.power_on();
     bench.await_boot_up(1000);

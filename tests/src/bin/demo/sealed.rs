@@ -11,7 +11,7 @@ use coflash_core::file::sealed::Sealer;
 use crate::steps::{chapter, introduce, print_line, Outcome};
 
 /// The board gets its keys; it accepts valid images, and refuses all others.
-pub fn tell(bench: &mut Bench) -> Outcome<()> {
+pub fn run(bench: &mut Bench) -> Outcome<()> {
     chapter("Production: keys go into the bootloader's flash, which makes a sealed device of the board");
     let (root, release) = (root().public().id(), self::release().public().id());
     print_note(&format!("root key {root:08X}h: the device gets its public half"));
