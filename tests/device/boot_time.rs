@@ -4,7 +4,7 @@ use canopen::program::ProgramControl;
 use coboot_tests::bench::{control, press, Bench, ACKNOWLEDGED, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::file::convert::{program_of, Options, Region};
-use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::file::read::{read, Format};
 use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as ChipOptions;
@@ -14,19 +14,12 @@ use emulator::time::{Span, Time};
 /// The application, followed by other data up to 400 KiB.
 fn large_program() -> Program {
     const SIZE: u32 = 400 * 1024;
-    let base = firmware::board().programs[0].base;
-    let Firmware::Image(image) = read(&firmware::elf(firmware::APP_V1), None, None).expect("an ELF of ours")
-    else {
-        panic!("an ELF is no block file");
-    };
+    let place = firmware::board().programs[0];
     let mut bytes: Vec<u8> = (0..SIZE).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
-    for (address, data) in image.segments() {
-        let at = (address - base) as usize;
-        bytes[at..at + data.len()].copy_from_slice(&data);
-    }
-    let large = read(&bytes, Some(Format::Raw), Some(base)).expect("a raw image");
-    let options =
-        Options::default().region(Region::Strict(firmware::board().programs[0].into())).block_size(16_384);
+    let image = firmware::raw(firmware::APP_V1);
+    bytes[..image.len()].copy_from_slice(&image);
+    let large = read(&bytes, Some(Format::Raw), Some(place.base)).expect("a raw image");
+    let options = Options::default().region(Region::Strict(place.into())).block_size(16_384);
     program_of(large, &options).expect("it fits").program
 }
 
@@ -56,8 +49,7 @@ fn fills(costs: bool, limit: fn(u64) -> u64) {
     let mut bench = running_board(ChipOptions { costs, ..ChipOptions::default() });
     // Its two regions follow each other.
     let [journal, _] = firmware::board().parameters;
-    let mut fresh = vec![0; 2 * journal.size as usize];
-    bench.machine().read_memory(journal.base, &mut fresh).unwrap();
+    let fresh = bench.memory(journal.base, 2 * journal.size as usize);
     let measured = FILLS.map(|left| {
         starts(&mut bench, |bench| {
             bench.machine().load_bin(journal.base, &fresh).unwrap();

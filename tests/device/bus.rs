@@ -72,8 +72,12 @@ fn three_devices_are_updated_one_after_the_other_and_one_of_them_had_no_node_id(
     install(&mut bench.session_with(3), firmware::APP_V1);
 
     // Does any device have no node-ID? Then the device with this identity gets the next free one.
-    let unconfigured = bench.ask(LSS_REQUEST, &[0x4C, 0, 0, 0, 0, 0, 0, 0], LSS_RESPONSE);
-    assert_eq!(unconfigured.as_deref(), Some(&[0x50, 0, 0, 0, 0, 0, 0, 0][..]));
+    bench.assert_answer(
+        LSS_REQUEST,
+        &[0x4C, 0, 0, 0, 0, 0, 0, 0],
+        LSS_RESPONSE,
+        &[0x50, 0, 0, 0, 0, 0, 0, 0],
+    );
     // Vendor, product and revision from the board file.
     let identity = &bsp::IDENTITY;
     for (command, part) in
@@ -233,8 +237,12 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
         bench.run_ms(1);
     }
     bench.run_ms(996);
-    let granted = bench.ask(REQUEST, &[0xC6, 0x50, 0x1F, 0x01, 0xF2, 0x06, 0, 0], RESPONSE);
-    assert_eq!(granted.as_deref(), Some(&[0xA4, 0x50, 0x1F, 0x01, 127, 0, 0, 0][..]));
+    bench.assert_answer(
+        REQUEST,
+        &[0xC6, 0x50, 0x1F, 0x01, 0xF2, 0x06, 0, 0],
+        RESPONSE,
+        &[0xA4, 0x50, 0x1F, 0x01, 127, 0, 0, 0],
+    );
     let segments: Vec<&[u8]> = block.chunks(7).collect();
     for sub_block in segments.chunks(127) {
         let sent = bench.time();
@@ -268,8 +276,7 @@ fn a_burst_of_127_segments_back_to_back_at_1_mbit_is_taken_without_loss() {
         late.0 / BIT.0
     );
     let [low, high, ..] = crc16(&block).to_le_bytes();
-    let ended = bench.ask(REQUEST, &[0xC1, low, high, 0, 0, 0, 0, 0], RESPONSE);
-    assert_eq!(ended.as_deref(), Some(&[0xA1, 0, 0, 0, 0, 0, 0, 0][..]));
+    bench.assert_answer(REQUEST, &[0xC1, low, high, 0, 0, 0, 0, 0], RESPONSE, &[0xA1, 0, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
     // The status is not busy as soon as there is room for the next block; the flash must still
     // erase and program.

@@ -252,8 +252,7 @@ fn every_service_works_on_the_stack_alone() {
         if !ccm.is_empty() {
             bench.machine().write_ram(layout.chip.ccm.base, &ccm).unwrap();
         }
-        let mut cells = [0; 64];
-        bench.machine().read_memory(layout.ram.end(), &mut cells).unwrap();
+        let cells = bench.memory(layout.ram.end(), 64);
 
         let mut run = |bench: &mut Bench, selector, words| {
             bench.machine().take_touched();
@@ -294,14 +293,11 @@ fn every_service_works_on_the_stack_alone() {
         assert_eq!(run(&mut bench, READ_NODE, [0; 5]).1[..2], [9, 250_000]);
         assert_eq!(run(&mut bench, STORE_NODE, [1, 125_000, 3, 4, 5]).0, OK);
 
-        let mut after = ccm.clone();
-        if !ccm.is_empty() {
-            bench.machine().read_memory(layout.chip.ccm.base, &mut after).unwrap();
-        }
-        assert!(after == ccm, "the CCM was written to");
-        let mut cells_after = [0; 64];
-        bench.machine().read_memory(layout.ram.end(), &mut cells_after).unwrap();
-        assert_eq!(cells_after, cells, "handoff and warm-start cell");
+        assert!(
+            ccm.is_empty() || bench.memory(layout.chip.ccm.base, ccm.len()) == ccm,
+            "the CCM was written to"
+        );
+        assert_eq!(bench.memory(layout.ram.end(), 64), cells, "handoff and warm-start cell");
     }
     println!("bytes of stack by selector: {stacks:?} of {}", callgate::STACK);
     assert_eq!(bench.events(), []);

@@ -122,8 +122,7 @@ fn a_clear_that_ends_an_abandoned_block_download_is_the_bootloaders() {
     let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
     abandon(&mut bench, CONTROL, BLKSIZE, 3);
     bench.run_ms(5);
-    let answer = bench.ask(REQUEST, &CLEAR, RESPONSE);
-    assert_eq!(answer.as_deref(), Some(&[0x60, 0x51, 0x1F, 1, 0, 0, 0, 0][..]));
+    bench.assert_answer(REQUEST, &CLEAR, RESPONSE, &[0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]);
     assert!(bench.is_bootloader(NODE));
     // The second CLEAR erases, and the first one would not have. 3: there is no program.
     assert!(bench.ask(REQUEST, &CLEAR, RESPONSE).is_some());

@@ -42,8 +42,7 @@ fn without_its_crystal_a_device_only_listens_until_lss_speaks() {
     // Switch state global to configuration, inquire node-ID (CiA 305).
     let from = bench.time();
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
-    assert_eq!(answer.as_deref(), Some(&[0x5E, NODE, 0, 0, 0, 0, 0, 0][..]));
+    bench.assert_answer(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4, &[0x5E, NODE, 0, 0, 0, 0, 0, 0]);
     bench.post(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
     bench.run_ms(20);
     let said = bench.frames_since(from);
@@ -99,8 +98,7 @@ fn a_silent_device_hears_a_host_that_is_alone() {
 fn a_crystal_that_stops_is_a_watchdog_reset_and_then_silence_until_lss_speaks() {
     let mut bench = Bench::new();
     bench.world.add_host_port(BIT_RATE);
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     bench.run_ms(20);
     bench.events();
     let stopped = bench.time();
@@ -112,22 +110,19 @@ fn a_crystal_that_stops_is_a_watchdog_reset_and_then_silence_until_lss_speaks() 
     assert!((700..=1_900).contains(&((at - stopped).0 / 1_000_000_000)), "{events:?}");
     assert_eq!(bench.frames_since(at), []);
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
-    assert_eq!(answer.as_deref(), Some(&[0x5E, NODE, 0, 0, 0, 0, 0, 0][..]));
+    bench.assert_answer(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4, &[0x5E, NODE, 0, 0, 0, 0, 0, 0]);
     assert_eq!(bench.number(0x2007, 5), 2);
 
     bench.power_off();
     bench.machine().set_crystal(bsp::CLOCK_TREE.hse);
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     assert_eq!(bench.number(0x2007, 5), 1);
 }
 
 #[test]
 fn a_product_that_is_to_speak_in_any_case_does_and_says_so() {
     let mut bench = failed(firmware::BOOTLOADER_LEAST);
-    bench.power_on();
-    bench.await_boot_up(200);
+    bench.switch_on();
     bench.run_ms(20);
     assert_eq!(bench.number(0x2007, 5), 2);
 }

@@ -5,12 +5,11 @@ use std::time::Duration;
 
 use canopen::debugger::Stop as DebugStop;
 use canopen::Address;
-use coboot_tests::bench::{Bench, HEARTBEAT, NODE};
+use coboot_tests::bench::{abort_code, Bench, HEARTBEAT, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{firmware, script, tools};
 use coflash_core::device::debugger::{Debugger, NoBreakpoint, Stopped};
 use coflash_core::device::Doing;
-use coflash_core::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
 
@@ -54,20 +53,12 @@ fn symbol(name: &str) -> u32 {
     firmware::symbol(firmware::APP_DEBUGGER, |of| of == name)
 }
 
-fn code(outcome: Result<(), Error>) -> Option<u32> {
-    match outcome {
-        Ok(()) => None,
-        Err(Error::Refused { code, .. }) => Some(code.0),
-        Err(error) => panic!("{error}"),
-    }
-}
-
 /// Sends a command; returns the abort code.
 fn command(bench: &mut Bench, kind: u8, address: u32, len: u16) -> Option<u32> {
     let [low, high] = len.to_le_bytes();
     let [a, b, c, d] = address.to_le_bytes();
     let bytes = [kind, 0, low, high, a, b, c, d];
-    code(bench.session().write(COMMAND, &bytes, Doing::Write(COMMAND), &mut |_| {}))
+    abort_code(bench.session().write(COMMAND, &bytes, Doing::Write(COMMAND), &mut |_| {}))
 }
 
 fn read(bench: &mut Bench, address: u32, len: u16) -> Vec<u8> {
@@ -86,12 +77,6 @@ fn read_word(bench: &mut Bench, address: u32) -> u32 {
 
 fn write_word(bench: &mut Bench, address: u32, value: u32) {
     write(bench, address, &value.to_le_bytes());
-}
-
-fn seen(bench: &mut Bench, address: u32, len: usize) -> Vec<u8> {
-    let mut bytes = vec![0; len];
-    bench.machine().read_memory(address, &mut bytes).unwrap();
-    bytes
 }
 
 /// 6200h, no error in the error register, the type, the address (the table of the five bytes in the
@@ -139,16 +124,16 @@ fn the_bootloader_reads_and_writes_what_there_is() {
         (0x1FFF_7A10, 12),
         (board.ram.end() - 64, 64),
     ] {
-        let expected = seen(&mut bench, address, len);
+        let expected = bench.memory(address, len);
         assert_eq!(read(&mut bench, address, len as u16), expected, "{address:08X}");
     }
     // The handoff is unused while the bootloader runs. An odd address and an odd length, with both
     // neighbours unchanged.
     let at = board.handoff.base + 1;
-    let mut expected = seen(&mut bench, at - 1, 16);
+    let mut expected = bench.memory(at - 1, 16);
     expected[1..14].copy_from_slice(b"thirteen long");
     write(&mut bench, at, b"thirteen long");
-    assert_eq!(seen(&mut bench, at - 1, 16), expected);
+    assert_eq!(bench.memory(at - 1, 16), expected);
     assert_eq!(bench.session().read_number(STATUS).unwrap(), 0);
     // Registers: CPUID of the Cortex-M4 r0p1; GPIOE has no clock, but can be read.
     assert_eq!(read_word(&mut bench, 0xE000_ED00), 0x410F_C241);
@@ -214,12 +199,12 @@ fn memory_that_does_not_answer_now_is_refused_now() {
         bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
     }
     assert_eq!(command(&mut bench, 0, board.bootloader.base, 4), None);
-    let outcome = bench.session().upload(DATA, &mut |_| {}).map(|_| ());
-    assert_eq!(code(outcome), Some(0x0800_0021));
+    let outcome = bench.session().upload(DATA, &mut |_| {});
+    assert_eq!(abort_code(outcome), Some(0x0800_0021));
     assert_eq!(read(&mut bench, board.handoff.base, 4).len(), 4, "RAM has nothing to do with it");
     let status = bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     assert_eq!(status.to_word(), 0);
-    let expected = seen(&mut bench, board.bootloader.base, 4);
+    let expected = bench.memory(board.bootloader.base, 4);
     assert_eq!(read(&mut bench, board.bootloader.base, 4), expected);
     // RCC_AHB1ENR bit 20 is the clock of the CCM, if the chip has one.
     let ccm = board.chip.ccm;
@@ -230,11 +215,11 @@ fn memory_that_does_not_answer_now_is_refused_now() {
     let clocks = read_word(&mut bench, 0x4002_3830);
     write_word(&mut bench, 0x4002_3830, clocks & !(1 << 20));
     assert_eq!(command(&mut bench, 0, ccm.end() - 4, 4), None);
-    let outcome = bench.session().upload(DATA, &mut |_| {}).map(|_| ());
-    assert_eq!(code(outcome), Some(0x0800_0021));
+    let outcome = bench.session().upload(DATA, &mut |_| {});
+    assert_eq!(abort_code(outcome), Some(0x0800_0021));
     assert_eq!(command(&mut bench, 1, ccm.end() - 4, 4), None);
     let outcome = bench.session().write(DATA, &[9; 4], Doing::Write(DATA), &mut |_| {});
-    assert_eq!(code(outcome), Some(0x0800_0021));
+    assert_eq!(abort_code(outcome), Some(0x0800_0021));
     write_word(&mut bench, 0x4002_3830, clocks);
     assert_eq!(read(&mut bench, ccm.end() - 4, 4), [1, 2, 3, 4]);
 }
@@ -243,19 +228,19 @@ fn memory_that_does_not_answer_now_is_refused_now() {
 fn data_of_another_length_are_refused() {
     let at = firmware::board().handoff.base;
     for mut bench in [bootloader(), application()] {
-        let before = seen(&mut bench, at, 16);
+        let before = bench.memory(at, 16);
         assert_eq!(command(&mut bench, 1, at, 8), None);
         for (len, abort) in [(7, 0x0607_0013), (9, 0x0607_0012), (500, 0x0607_0012)] {
             let data = vec![0xA5; len];
-            let outcome = code(bench.session().write(DATA, &data, Doing::Write(DATA), &mut |_| {}));
+            let outcome = abort_code(bench.session().write(DATA, &data, Doing::Write(DATA), &mut |_| {}));
             assert_eq!(outcome, Some(abort), "{len} bytes");
-            assert_eq!(seen(&mut bench, at, 16), before, "{len} bytes");
+            assert_eq!(bench.memory(at, 16), before, "{len} bytes");
         }
         // 08000024h: no data.
-        let nothing = bench.session().upload(DATA, &mut |_| {}).map(|_| ());
-        assert_eq!(code(nothing), Some(0x0800_0024));
+        let nothing = bench.session().upload(DATA, &mut |_| {});
+        assert_eq!(abort_code(nothing), Some(0x0800_0024));
         write(&mut bench, at, &[1; 8]);
-        assert_eq!(seen(&mut bench, at, 9), [&[1; 8][..], &before[8..9]].concat());
+        assert_eq!(bench.memory(at, 9), [&[1; 8][..], &before[8..9]].concat());
     }
 }
 
@@ -265,16 +250,16 @@ fn a_secured_device_tells_nothing() {
     for rdp in [0x55, 0xCC] {
         for mut bench in [bootloader(), application()] {
             let at = firmware::board().handoff.base;
-            let before = seen(&mut bench, at, 4);
+            let before = bench.memory(at, 4);
             assert_eq!(command(&mut bench, 0, at, 4), None);
             bench.machine().set_read_protection(rdp);
-            assert_eq!(code(bench.session().upload(DATA, &mut |_| {}).map(|_| ())), DEVICE_STATE);
+            assert_eq!(abort_code(bench.session().upload(DATA, &mut |_| {})), DEVICE_STATE);
             for kind in [0, 1] {
                 assert_eq!(command(&mut bench, kind, at, 4), DEVICE_STATE);
                 let outcome = bench.session().write(DATA, &[9; 4], Doing::Write(DATA), &mut |_| {});
-                assert_eq!(code(outcome), DEVICE_STATE);
+                assert_eq!(abort_code(outcome), DEVICE_STATE);
             }
-            assert_eq!(seen(&mut bench, at, 4), before);
+            assert_eq!(bench.memory(at, 4), before);
             bench.machine().set_read_protection(0xAA);
             assert_eq!(read(&mut bench, at, 4), before);
         }
@@ -429,7 +414,7 @@ fn a_step_over_a_breakpoint_is_not_lost_to_an_interrupt() {
     let mut bench = application();
     let idle = firmware::symbol(firmware::APP_DEBUGGER, |name| name.contains("3app4idle17h"));
     // WFI is BF30h.
-    let code = seen(&mut bench, idle, 64);
+    let code = bench.memory(idle, 64);
     let wfi = (0..64).step_by(2).find(|&n| code[n..n + 2] == [0x30, 0xBF]).expect("it sleeps");
     let wfi = idle + wfi as u32;
     stop_at(&mut bench, wfi);
@@ -529,8 +514,7 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     let second = Duration::from_secs(1);
     let board = firmware::board();
     let flash = board.chip.flash.base;
-    let mut start = vec![0; 5000];
-    bench.machine().read_memory(flash, &mut start).unwrap();
+    let start = bench.memory(flash, 5000);
     let mut session = bench.session();
     let mut debugger = Debugger::new(&mut session);
     assert_eq!(debugger.read(flash, 5000, &mut |_| {}).unwrap(), start);

@@ -2,7 +2,7 @@
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
-use coboot_tests::bench::{press, Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
+use coboot_tests::bench::{abort_code, press, Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
 use coflash_core::update::event::Phase;
@@ -38,12 +38,7 @@ fn program_start() -> u32 {
 /// Sends a block; returns the abort code and the status after all work.
 fn send(bench: &mut Bench, block: &[u8]) -> (Option<u32>, u32) {
     let mut session = bench.session();
-    let outcome = session.write(DATA, block, Doing::Block(0), &mut |_| {});
-    let abort = match outcome {
-        Ok(()) => None,
-        Err(Error::Refused { code, .. }) => Some(code.0),
-        Err(error) => panic!("{error}"),
-    };
+    let abort = abort_code(session.write(DATA, block, Doing::Block(0), &mut |_| {}));
     let status = session.await_idle(1, Doing::Read(STATUS)).unwrap();
     (abort, status.to_word())
 }
@@ -113,10 +108,13 @@ fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
     bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
     // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, then
     // nothing.
-    let initiated = bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
-    assert_eq!(initiated.as_deref(), Some(&[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0][..]));
-    let segment = bench.ask(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
-    assert_eq!(segment.as_deref(), Some(&[0x20, 0, 0, 0, 0, 0, 0, 0][..]));
+    bench.assert_answer(
+        REQUEST,
+        &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0],
+        RESPONSE,
+        &[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0],
+    );
+    bench.assert_answer(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE, &[0x20, 0, 0, 0, 0, 0, 0, 0]);
     // Another client begins at once, and gets answers.
     assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
     // Again, and this time the server's time-out ends the transfer: abort 05040000h for 1F50h/1.
@@ -247,8 +245,7 @@ fn the_entry_strap_holds_the_device_in_the_bootloader() {
         println!("this board has no strap");
         return;
     }
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     assert!(bench.is_bootloader(NODE));
     press(bench.machine(), false);
     bench.power_off();
@@ -263,8 +260,7 @@ fn nmt_resets_restart_the_device_or_the_communication() {
     bench.call_back();
     bench.events();
     // Reset communication (82h) to this node: a boot-up message, and no reset of the chip.
-    let boot_up = bench.ask(0, &[0x82, NODE], HEARTBEAT);
-    assert_eq!(boot_up.as_deref(), Some(&[0][..]));
+    bench.assert_answer(0, &[0x82, NODE], HEARTBEAT, &[0]);
     assert_eq!(bench.events(), []);
     // Start (01h) to all: the bootloader stays PRE-OPERATIONAL (7Fh).
     bench.post(0, &[0x01, 0]);
@@ -306,9 +302,7 @@ fn code_left_in_flash_would_not_answer_in_time() {
     let stub_address = firmware::board().bootloader.end() - 0x100;
     // CAN1_TX is interrupt 19 (RM0090 table 61); the vector table is at the beginning of the RAM.
     let vector = firmware::board().ram.base + (16 + 19) * 4;
-    let mut handler = [0; 4];
-    bench.machine().read_memory(vector, &mut handler).unwrap();
-    let stub = [&[0xDF, 0xF8, 0x00, 0xF0], &handler[..]].concat();
+    let stub = [&[0xDF, 0xF8, 0x00, 0xF0], &bench.memory(vector, 4)[..]].concat();
     bench.machine().load_bin(stub_address, &stub).unwrap();
     bench.machine().write_ram(vector, &(stub_address | 1).to_le_bytes()).unwrap();
     assert!(bench.is_bootloader(NODE), "it works as long as nothing is erased");

@@ -8,17 +8,12 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
-use coflash_core::file::convert::{program_of, Options};
-use coflash_core::file::read::{read, Format};
 use coflash_core::update::steps::release;
 use coflash_core::update::{flash, FlashOptions};
 
 /// The return of the tests' application (object 2000h): the value for the jump.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);
 const JUMP: u8 = 2;
-
-/// A jump to itself, in Thumb.
-const HERE: [u8; 2] = [0xFE, 0xE7];
 
 const RCC: u32 = 0x4002_3800;
 const AHB1ENR: u32 = RCC + 0x30;
@@ -49,10 +44,8 @@ fn registers(bench: &mut Bench) -> BTreeMap<u32, u32> {
 
 /// Replaces a program's first instruction by an endless loop; returns its address.
 fn stop_at_reset_of(bench: &mut Bench, table: u32) -> u32 {
-    let mut vector = [0; 4];
-    bench.machine().read_memory(table + 4, &mut vector).unwrap();
-    let first = u32::from_le_bytes(vector) & !1;
-    bench.machine().load_bin(first, &HERE).unwrap();
+    let first = bench.word(table + 4) & !1;
+    bench.machine().load_bin(first, &firmware::HERE).unwrap();
     first
 }
 
@@ -110,15 +103,8 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
 #[test]
 fn the_application_finds_the_chip_as_after_a_reset() {
     let program = firmware::board().programs[0].base;
-    let first = program + 0x200;
-    // A program without effects: a vector table and a loop. It does not change any register.
-    let mut image = vec![0; 0x400];
-    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
-    image[4..8].copy_from_slice(&(first | 1).to_le_bytes());
-    image[0x200..0x202].copy_from_slice(&HERE);
-    let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
-    let blocks = program_of(image, &Options::default()).unwrap().program;
-
+    // It does not change any register.
+    let (first, blocks) = firmware::endless_loop();
     let mut bench = Bench::new().switched_on();
     let options = FlashOptions::default().start(false);
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();

@@ -5,6 +5,7 @@ mod gdb;
 
 use coboot_tests::bench::{press, Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::renewal::image_of;
 use emulator::machine::{ResetCause, Stop};
 use kit::rig::crc32;
 use object::elf::{FileHeader32, PT_LOAD};
@@ -41,9 +42,8 @@ impl Parts {
         let (base, resident) = firmware::section(&elf, ".resident");
         assert_eq!(base, firmware::board().bootloader.base);
         let (home, header) = firmware::section(&elf, ".ram_image");
-        let (_, ram) = firmware::section(&elf, ".data");
         assert_eq!(header.len(), HEADER);
-        Self { resident, home, image: [header, ram].concat() }
+        Self { resident, home, image: image_of(name) }
     }
 
     /// The image without its header, as it is in RAM.
@@ -262,8 +262,7 @@ fn started(parts: &Parts) -> Bench {
 
 /// The warm-start cell as a debugger reads it: request and argument, if it is valid.
 fn cell(bench: &Bench) -> Option<(u32, u32)> {
-    let mut bytes = [0; 16];
-    bench.world.machine(bench.device).read_memory(firmware::board().warm_start.base, &mut bytes).unwrap();
+    let bytes = bench.memory(firmware::board().warm_start.base, 16);
     let [magic, request, argument, check] = words(&bytes)[..] else { unreachable!("16 bytes") };
     let sound = check == check_word(&[magic, request, argument]);
     (magic == u32::from_le_bytes(*b"CBW1") && sound).then_some((request, argument))
@@ -344,8 +343,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     let mut bench = board_with_a_program();
     for (what, image, damage) in damages() {
         load(&mut bench, &image);
-        bench.power_on();
-        bench.await_boot_up(1000);
+        bench.switch_on();
         assert!(!bench.is_bootloader(NODE), "{what}: the start of a program needs nothing of the image");
         assert_eq!(cell(&bench), None, "{what}");
         bench.events();
@@ -367,23 +365,20 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     let (_, image, damage) = damages().swap_remove(0);
     load(&mut bench, &image);
     press(bench.machine(), true);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, damage)));
     press(bench.machine(), false);
     bench.power_off();
     // Nor does a journal without room, which nobody compacts.
     bench.fill_journal(0);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, damage)));
     bench.power_off();
     // The image itself, for comparison: it makes room, and then the program starts.
     load(&mut bench, &Parts::of(firmware::BOOTLOADER));
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     bench.await_boot_up(1000);
     bench.call_back();
     assert!(bench.is_bootloader(NODE));
@@ -432,20 +427,15 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
     let mut bench = board_with_a_program();
     let (_, image, _) = damages().swap_remove(0);
     load(&mut bench, &image);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     for reset in 1..=6 {
         bench.machine().preset_watchdog(64);
         bench.run_ms(300);
         assert!(!bench.is_bootloader(NODE), "after {reset}");
         assert_eq!(cell(&bench).is_some(), reset >= 3, "after {reset}");
     }
-    let parameters = |bench: &Bench| {
-        let mut bytes = vec![0; firmware::board().parameters[0].size as usize * 2];
-        let at = firmware::board().parameters[0].base;
-        bench.world.machine(bench.device).read_memory(at, &mut bytes).unwrap();
-        bytes
-    };
+    let [journal, _] = firmware::board().parameters;
+    let parameters = |bench: &Bench| bench.memory(journal.base, 2 * journal.size as usize);
     let before = parameters(&bench);
     bench.machine().preset_watchdog(64);
     bench.run_ms(300);
@@ -459,15 +449,13 @@ fn without_autostart_the_program_runs_beside_a_damaged_image() {
     let least = Parts::of(firmware::BOOTLOADER_LEAST);
     let mut bench = board_with_a_program();
     load(&mut bench, &least);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     assert!(bench.is_bootloader(NODE));
     bench.power_off();
     let mut damaged = least;
     damaged.image[0] ^= 1;
     load(&mut bench, &damaged);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, BY_HEADER)));
 }

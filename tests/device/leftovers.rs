@@ -7,8 +7,6 @@ use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
-use coflash_core::file::convert::{program_of, Options};
-use coflash_core::file::read::{read, Format};
 use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::{Outcome, Record};
@@ -202,14 +200,12 @@ fn sealed() -> Option<&'static str> {
 /// forgotten breakpoint would end the trial of a good one.
 #[test]
 fn no_reset_leaves_a_patch_or_a_breakpoint() {
-    let vector = |image: &[u8]| u32::from_le_bytes(image[4..8].try_into().unwrap()) & !1;
     for image in iter::once(firmware::BOOTLOADER).chain(sealed()) {
         let mut bench = Bench::of_image(image).switched_on();
-        let mut words = [0; 8];
-        bench.machine().read_memory(firmware::board().bootloader.base, &mut words).unwrap();
         // After the first instructions, which no program can guard, Reset goes straight on for some time.
-        let code = vector(&words) + 0x40;
-        let program = vector(&firmware::raw(firmware::APP_V1));
+        let code = (bench.word(firmware::board().bootloader.base + 4) & !1) + 0x40;
+        let program = firmware::raw(firmware::APP_V1);
+        let program = u32::from_le_bytes(program[4..8].try_into().unwrap()) & !1;
         let in_reset = [(FP_COMP0, code | 1), (FP_COMP0 + 4, program | 0xC000_0001)];
         for way in [ResetCause::Pin, ResetCause::Software, ResetCause::WindowWatchdog] {
             poke(&mut bench, &DEBUG_UNITS);
@@ -268,8 +264,7 @@ fn scripted_program(wrong: &Wrong) -> Program {
     }
     image.extend(SCRIPT.into_iter().chain(table).flat_map(u16::to_le_bytes));
     image.resize(0x400.max(image.len()), 0);
-    let image = read(&image, Some(Format::Raw), Some(base)).unwrap();
-    program_of(image, &Options::default()).unwrap().program
+    firmware::blocks_of_raw(&image)
 }
 
 /// A bootloader that has this program, with the silicon of caches that become stale.

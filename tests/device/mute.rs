@@ -10,33 +10,17 @@ use coboot_tests::firmware;
 use coboot_tests::fleet::Eventful;
 use coflash_core::device::error::TrialFailure;
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::convert::{program_of, Options};
-use coflash_core::file::read::{read, Format};
-use coflash_core::file::Program;
 use coflash_core::update::{
     catch, flash, CatchOptions, Caught, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions,
 };
 use coflash_core::Error;
 
-/// A jump to itself, in Thumb.
-const HERE: [u8; 2] = [0xFE, 0xE7];
 /// The time without power at the beginning, while the host already sends requests.
 const DARK: Duration = Duration::from_millis(2345);
 
-/// A vector table, and a reset handler with an endless loop.
-fn mute() -> Program {
-    let program = firmware::board().programs[0].base;
-    let mut image = vec![0; 0x400];
-    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
-    image[4..8].copy_from_slice(&((program + 0x200) | 1).to_le_bytes());
-    image[0x200..0x202].copy_from_slice(&HERE);
-    let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
-    program_of(image, &Options::default()).unwrap().program
-}
-
 fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate) {
     let mut left = None;
-    let error = flash(&mut bench.session(), mute(), options, &mut |event| {
+    let error = flash(&mut bench.session(), firmware::endless_loop().1, options, &mut |event| {
         if let Some(state) = event.left() {
             left = Some(state);
         }

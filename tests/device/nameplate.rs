@@ -6,9 +6,6 @@ use canopen::{Address, BitRate};
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
 use coflash_core::device::Doing;
-use coflash_core::file::convert::{program_of, Options, Region};
-use coflash_core::file::read::{read, Format};
-use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use shared_abi::label::Label;
@@ -82,13 +79,6 @@ fn program(image: &str, vendor_id: u32, product_code: u32) -> Vec<u8> {
     firmware::with_label(firmware::raw(image), &Label::new(vendor_id, product_code, 1))
 }
 
-/// It as the blocks that the tool sends; block 0 has what the label has.
-fn blocks(bytes: &[u8]) -> Program {
-    let place = firmware::board().programs[0];
-    let file = read(bytes, Some(Format::Raw), Some(place.base)).unwrap();
-    program_of(file, &Options::default().region(Region::Strict(place.into()))).unwrap().program
-}
-
 #[test]
 fn the_last_good_nameplate_is_the_identity() {
     let mut damaged = PLATE;
@@ -127,7 +117,7 @@ fn programs_are_for_the_oem_and_show_its_identity() {
     let once = FlashOptions::default().repeats(0);
     for (vendor, product, code) in [(other_vendor, product, 0x80), (vendor, other_product, 0x82)] {
         let bytes = program(firmware::APP_V1, vendor, product);
-        let file = blocks(&bytes);
+        let file = firmware::blocks_of_raw(&bytes);
         // The tool compares with 1018h; one that does not leaves it to the device.
         let refused = with(&mut bench, |session| flash(session, &file, &once, &mut |_| {}));
         assert!(matches!(refused, Err(Error::WrongTarget { .. })), "{refused:?}");
@@ -144,7 +134,7 @@ fn programs_are_for_the_oem_and_show_its_identity() {
         });
     }
     for image in [firmware::APP_V1, firmware::APP_C] {
-        let file = blocks(&program(image, vendor, product));
+        let file = firmware::blocks_of_raw(&program(image, vendor, product));
         with(&mut bench, |session| flash(session, &file, &FlashOptions::default(), &mut |_| {}).unwrap());
         assert_eq!(identity(&mut bench), (OEM, false), "{image}");
     }
@@ -159,8 +149,7 @@ fn programs_are_for_the_oem_and_show_its_identity() {
 fn a_product_without_the_choice_keeps_the_identity_of_the_board() {
     let mut bench = Bench::new();
     bench.machine().load_bin(OTP, &PLATE).unwrap();
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     let numbers = |bench: &mut Bench| [1, 2, 3, 4].map(|sub| bench.number(0x1018, sub));
     assert_eq!(numbers(&mut bench), of_board());
     bench.update(firmware::APP_V1);

@@ -32,8 +32,7 @@ fn running_board(image: &str) -> Bench {
 /// A command to 1F51h/1, which is acknowledged.
 #[track_caller]
 fn assert_acknowledged(bench: &mut Bench, command: u8) {
-    let answer = bench.ask(REQUEST, &control(command), RESPONSE);
-    assert_eq!(answer.as_deref(), Some(&ACKNOWLEDGED[..]), "{command:02X}h");
+    bench.assert_answer(REQUEST, &control(command), RESPONSE, &ACKNOWLEDGED);
 }
 
 /// The time of the chip's single reset.
@@ -282,7 +281,7 @@ fn commands_in_segments_are_answered_by_the_application() {
     let initiate = [0x21, 0x51, 0x1F, 1, 1, 0, 0, 0];
     for (value, end) in [(0, [0x20, 0, 0, 0, 0, 0, 0, 0]), (3, [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08])] {
         let mut bench = running_board(firmware::APP_V1);
-        assert_eq!(bench.ask(REQUEST, &initiate, RESPONSE).as_deref(), Some(&ACKNOWLEDGED[..]));
+        bench.assert_answer(REQUEST, &initiate, RESPONSE, &ACKNOWLEDGED);
         let segment = [0x0D, value, 0, 0, 0, 0, 0, 0];
         assert_eq!(bench.ask(REQUEST, &segment, RESPONSE).as_deref(), Some(&end[..]), "{value}");
         bench.run_ms(100);

@@ -182,8 +182,7 @@ fn node_id_and_bit_rate_are_shared() {
         bench.await_boot_up_of(21, 1000);
         assert!(!bench.is_bootloader(21));
         bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-        let node_id = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
-        assert_eq!(node_id.as_deref(), Some(&[0x5E, 21, 0, 0, 0, 0, 0, 0][..]));
+        bench.assert_answer(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4, &[0x5E, 21, 0, 0, 0, 0, 0, 0]);
         assert_eq!(bench.session_with(21).read_number(Address::new(0x1018, 4)).unwrap(), serial);
     }
 }
@@ -198,8 +197,7 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         let mut bench = running_board();
         bench.power_off();
         bench.machine().load_bin(at, &value.to_le_bytes()).unwrap();
-        bench.power_on();
-        bench.await_boot_up(1000);
+        bench.switch_on();
         assert!(!bench.is_bootloader(NODE));
         assert_eq!(bench.number(0x1F56, 1), 0, "no CRC without a callgate");
         // 08000022h: not in this state of the device.
@@ -286,8 +284,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
     bench.power_off();
     bench.run_ms(100);
     let from = bench.time();
-    bench.power_on();
-    let window = bench.await_boot_up(100);
+    let window = bench.switch_on();
     let program = bench.await_boot_up(1000);
     assert!(
         (290..340).contains(&((program - window).0 / 1_000_000_000)),
@@ -300,8 +297,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
 
     // Network management concerns all nodes, and keeps no device in the bootloader.
     bench.power_off();
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     bench.post(0x000, &[0x01, 0]);
     bench.await_boot_up(1000);
     assert!(!bench.is_bootloader(NODE));

@@ -126,8 +126,7 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
 fn the_watchdog_of_the_option_bytes_bites_in_no_step_of_a_renewal() {
     let mut bench = Bench::with(Options { silicon: WORST, ..Options::default() });
     bench.machine().set_hardware_watchdog(true);
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     let new = version(firmware::BOOTLOADER, NEW);
     stage(&mut bench, &new);
     assert_eq!(bench.events(), []);
@@ -225,8 +224,7 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
     for (confirmed, operation) in [(true, 7), (true, 8), (true, 2_000), (false, 2_000)] {
         let mut bench = if confirmed { board() } else { Bench::new() };
         if !confirmed {
-            bench.power_on();
-            bench.await_boot_up(100);
+            bench.switch_on();
         }
         stage(&mut bench, &new);
         start(&mut bench);

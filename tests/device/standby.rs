@@ -2,7 +2,6 @@
 
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 
@@ -19,10 +18,7 @@ pub(super) fn running_board(image: &str, program: &str, silicon: Silicon, has_wa
     let mut bench = Bench::of_image_with(image, Options { silicon, ..Options::default() });
     bench.machine().set_hardware_watchdog(has_watchdog);
     let mut bench = bench.switched_on();
-    let blocks = firmware::blocks(program);
-    // This program does not feed a watchdog: it would not live through the watch of the tool.
-    let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
-    flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
+    bench.install_unwatched(program).expect("it is installed");
     bench.confirm_program();
     bench.events();
     bench
@@ -66,9 +62,7 @@ fn a_device_that_wakes_up_starts_its_program_each_time() {
                 assert_eq!(stops, [Stop::Reset(ResetCause::Standby)], "{what}, wake-up {wake}");
                 assert!(!bench.is_bootloader(NODE), "{what}, wake-up {wake}");
             }
-            let mut cause = [0];
-            let handoff = firmware::board().handoff.base;
-            bench.machine().read_memory(handoff + 10, &mut cause).unwrap();
+            let cause = bench.memory(firmware::board().handoff.base + 10, 1);
             assert_eq!(cause, [STANDBY], "{what}");
             // The flags are cleared, for the next reset; and the program finds the power controller off.
             assert_eq!(bench.machine().register(PWR_CSR).unwrap() & 0b10, 0, "{what}");

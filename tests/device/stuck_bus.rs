@@ -1,11 +1,8 @@
 //! A line of the bus that something holds dominant for minutes (a short circuit, a transceiver without its
 //! supply), and then lets go.
 
-use std::time::Duration;
-
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options;
 use emulator::silicon::{Silicon, TYPICAL, WORST};
 use emulator::time::{Span, Time};
@@ -16,11 +13,6 @@ const PATIENCE_MS: u64 = 5_400;
 
 fn board(silicon: Silicon) -> Bench {
     Bench::with(Options { silicon, ..Options::default() })
-}
-
-fn update(bench: &mut Bench, image: &str) -> bool {
-    let options = FlashOptions::default().trial_run(false).watch(Some(Duration::ZERO));
-    flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).is_ok()
 }
 
 /// The line is free again: the device, which was never reset, is back in time.
@@ -42,7 +34,7 @@ fn a_bootloader_that_starts_on_a_dominant_line_is_there_when_it_is_free() {
         assert_eq!(bench.frames_since(Time(0)), [], "{what}");
         comes_back(&mut bench, &what);
         assert!(bench.is_bootloader(NODE), "{what}");
-        assert!(update(&mut bench, firmware::APP_V1), "{what}");
+        bench.install_unwatched(firmware::APP_V1).expect(&what);
     }
 }
 
@@ -53,15 +45,15 @@ fn an_update_on_a_line_that_falls_breaks_off_and_works_later() {
     for (after_ms, silicon) in [(5, TYPICAL), (800, WORST), (2_500, WORST)] {
         let what = format!("after {after_ms} ms, {silicon}");
         let mut bench = board(silicon).switched_on();
-        assert!(update(&mut bench, firmware::APP_V1), "{what}");
+        bench.install_unwatched(firmware::APP_V1).expect(&what);
         bench.call_back();
         bench.run_ms(20);
         bench.events();
         bench.world.hold_dominant_after(Span::from_millis(after_ms));
-        assert!(!update(&mut bench, firmware::APP_V2), "{what}");
+        assert!(bench.install_unwatched(firmware::APP_V2).is_err(), "{what}");
         bench.run_ms(MINUTE_MS);
         comes_back(&mut bench, &what);
-        assert!(update(&mut bench, firmware::APP_V2), "{what}");
+        bench.install_unwatched(firmware::APP_V2).expect(&what);
         assert!(!bench.is_bootloader(NODE), "{what}");
     }
 }
@@ -72,7 +64,7 @@ fn a_program_on_a_dominant_line_can_be_called_back_later() {
     for from_power_on in [false, true] {
         let what = format!("from power-on: {from_power_on}");
         let mut bench = board(TYPICAL).switched_on();
-        assert!(update(&mut bench, firmware::APP_V1), "{what}");
+        bench.install_unwatched(firmware::APP_V1).expect(&what);
         bench.confirm_program();
         if from_power_on {
             bench.power_off();

@@ -7,7 +7,6 @@ use coboot_tests::firmware;
 use coflash_core::device::option_bytes::OptionBytes;
 use coflash_core::device::read_state::read_state;
 use coflash_core::device::{Doing, Error};
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Operation, ResetCause, Stop};
 use emulator::time::Span;
 use shared_abi::geometry::{Line, Region};
@@ -29,8 +28,7 @@ fn board_with_a_program() -> Bench {
 }
 
 fn update(bench: &mut Bench, image: &str) -> Result<(), Error> {
-    let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
-    flash(&mut bench.session(), firmware::blocks(image), &options, &mut |_| {}).map(drop)
+    bench.install_unwatched(image).map(drop)
 }
 
 fn set_supply(bench: &mut Bench, mv: u32) {
@@ -246,8 +244,7 @@ fn with_each_level_of_read_out_protection_a_program_is_replaced_and_called_back(
     for rdp in [0x55, 0xCC] {
         let mut bench = Bench::new();
         bench.machine().set_read_protection(rdp);
-        bench.power_on();
-        bench.await_boot_up(1_000);
+        bench.switch_on();
         for image in [firmware::APP_V1, firmware::APP_V2] {
             update(&mut bench, image).unwrap();
             assert!(!bench.is_bootloader(NODE));
@@ -267,8 +264,7 @@ fn with_bfb2_the_device_works_until_its_second_bank_begins_with_a_stack_pointer(
     let chip = firmware::board().chip;
     let mut bench = Bench::new();
     bench.machine().set_option_bytes(0x0FFF_AAEC | BFB2);
-    bench.power_on();
-    bench.await_boot_up(1_000);
+    bench.switch_on();
     update(&mut bench, firmware::APP_V1).unwrap();
     bench.call_back();
     bench.run_ms(20);

@@ -5,7 +5,6 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
@@ -26,12 +25,8 @@ fn running_bootloader() -> Bench {
 
 /// A board with a program that was called back.
 fn bootloader_with_a_program(bench: &mut Bench) {
-    bench.power_on();
-    bench.await_boot_up(100);
-    let file = firmware::blocks(firmware::APP_V1);
-    // This program does not feed a watchdog: it would not live through the watch of the tool.
-    let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
-    flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
+    bench.switch_on();
+    bench.install_unwatched(firmware::APP_V1).expect("it is installed");
     bench.call_back();
     bench.run_ms(20);
     bench.events();

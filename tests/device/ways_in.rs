@@ -186,9 +186,7 @@ fn load_rom(bench: &mut Bench) {
 }
 
 fn rom_runs(bench: &mut Bench) -> bool {
-    let mut word = [0; 4];
-    bench.machine().read_memory(0x2000_0080, &mut word).unwrap();
-    bench.machine().pc() & !0xFFF == 0x1FFF_0000 && word == 0x600D_u32.to_le_bytes()
+    bench.machine().pc() & !0xFFF == 0x1FFF_0000 && bench.word(0x2000_0080) == 0x600D
 }
 
 /// Writes the signature to 2008h.
@@ -226,23 +224,19 @@ fn the_rom_loader_finds_the_chip_as_after_a_reset() {
     let expected = [0x1FFF_0000, 0, found[2], 0x2400_3010, 0, 0x0010_0000, 0, 0, power, 0, 0, 1];
     assert_eq!(found, expected, "{found:08X?}");
     // The vectors at address 0 are those of the ROM, too.
-    let mut vector = [0; 4];
-    bench.machine().read_memory(0, &mut vector).unwrap();
-    assert_eq!(vector, 0x2000_2D40_u32.to_le_bytes());
+    assert_eq!(bench.word(0), 0x2000_2D40);
     bench.run_ms(5000);
     assert!(rom_runs(&mut bench), "no watchdog ends it");
     bench.assert_nothing_unmodelled();
     bench.power_off();
     // While the journal makes room the program waits, and then it does not start instead.
     bench.fill_journal(0);
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     assert_eq!(start_rom_loader(&mut bench), Ok(()));
     bench.run_ms(800);
     assert!(rom_runs(&mut bench));
     bench.power_off();
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     assert!(!bench.is_bootloader(NODE));
 }
 

@@ -161,8 +161,7 @@ fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
     let Some(mut bench) = board("bootloader-esacademy") else { return };
     bench.post(0x7E5, &[0x04, 0x01, 0, 0, 0, 0, 0, 0]);
     for request in [[0x13, 0, 9, 0, 0, 0, 0, 0], [0x17, 0, 0, 0, 0, 0, 0, 0]] {
-        let answer = bench.ask(0x7E5, &request, 0x7E4);
-        assert_eq!(answer.as_deref(), Some(&[request[0], 0, 0, 0, 0, 0, 0, 0][..]));
+        bench.assert_answer(0x7E5, &request, 0x7E4, &[request[0], 0, 0, 0, 0, 0, 0, 0]);
     }
     for rate in [500_000, 50_000] {
         bench.power_off();
@@ -258,8 +257,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     let at = LAYOUT.programs[0].base + 0x1000;
     let byte = bench.machine().flash()[(at - LAYOUT.chip.flash.base) as usize];
     bench.machine().load_bin(at, &[byte ^ 1]).unwrap();
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     assert!(bench.is_bootloader(NODE));
     bench.assert_nothing_unmodelled();
 }

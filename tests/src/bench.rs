@@ -8,7 +8,7 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash_core::device::{Doing, Session, Timing};
+use coflash_core::device::{Doing, Error, Session, Timing};
 use coflash_core::update::{flash, FlashOptions, Report};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
@@ -48,7 +48,6 @@ pub const RESPONSE: u32 = 0x580 + NODE as u32;
 pub const HEARTBEAT: u32 = 0x700 + NODE as u32;
 
 /// The SDO request 1F51h/1 := value (CiA 301, 7.2.4.3.3).
-#[must_use]
 pub const fn control(value: u8) -> [u8; 8] {
     [0x2F, 0x51, 0x1F, 1, value, 0, 0, 0]
 }
@@ -69,7 +68,6 @@ pub struct Bench {
 
 impl Bench {
     /// A board with the bootloader in its flash, still without power.
-    #[must_use]
     pub fn new() -> Self {
         Self::with(Options::default())
     }
@@ -78,26 +76,22 @@ impl Bench {
     ///
     /// # Panics
     /// If the emulator cannot be set up, or the firmware was not built.
-    #[must_use]
     pub fn with(options: Options) -> Self {
         Self::of(firmware::BOOTLOADER, vec![options])
     }
 
     /// A board with this bootloader.
-    #[must_use]
     pub fn of_image(bootloader: &str) -> Self {
         Self::of(bootloader, vec![Options::default()])
     }
 
     /// A board with this bootloader on a given chip.
-    #[must_use]
     pub fn of_image_with(bootloader: &str, options: Options) -> Self {
         Self::of(bootloader, vec![options])
     }
 
     /// The same with the transceiver at this CAN controller, 1 or 2, instead of the board's own
     /// one.
-    #[must_use]
     pub fn of_image_at(bootloader: &str, controller: u8) -> Self {
         Self::at(controller, bootloader, vec![Options::default()])
     }
@@ -107,7 +101,6 @@ impl Bench {
     ///
     /// # Panics
     /// As [`with`](Self::with), and for zero boards.
-    #[must_use]
     pub fn of_boards(count: u32) -> Self {
         Self::of_boards_with(firmware::BOOTLOADER, count)
     }
@@ -116,7 +109,6 @@ impl Bench {
     ///
     /// # Panics
     /// As [`of_boards`](Self::of_boards).
-    #[must_use]
     pub fn of_boards_with(bootloader: &str, count: u32) -> Self {
         let options = |n| {
             let Options { unique_id: [position, lot, more], .. } = Options::default();
@@ -173,20 +165,17 @@ impl Bench {
     }
 
     /// All boards, as [`World::machine_mut`] names them.
-    #[must_use]
     pub fn boards(&self) -> Vec<MachineId> {
         self.boards.clone()
     }
 
     /// Virtual time.
-    #[must_use]
     pub fn time(&self) -> Time {
         self.world.now()
     }
 
     /// Virtual time while a session borrows the bench: the time of the host's last access to the
     /// bus.
-    #[must_use]
     pub fn clock(&self) -> Rc<Cell<Time>> {
         Rc::clone(&self.clock)
     }
@@ -237,9 +226,6 @@ impl Bench {
 
     /// Writes zeros to the end of the flash of every program, and to the end of every sector in it,
     /// as a debug probe could: each sector must then be erased before anything can be written.
-    ///
-    /// # Panics
-    /// Never: the layout's programs are in flash.
     pub fn soil_programs(&mut self) {
         let board = firmware::board();
         for program in board.programs {
@@ -252,15 +238,11 @@ impl Bench {
     }
 
     /// Writes the last record of the journal into its free slots but the last `left`, as a debug probe could.
-    ///
-    /// # Panics
-    /// Never: the layout's parameters are in flash.
     pub fn fill_journal(&mut self, left: usize) {
         /// Seven words.
         const SLOT: usize = 28;
         for region in firmware::board().parameters {
-            let mut bytes = vec![0; region.size as usize];
-            self.machine().read_memory(region.base, &mut bytes).expect("it is in flash");
+            let mut bytes = self.memory(region.base, region.size as usize);
             let used = bytes.iter().rposition(|byte| *byte != 0xFF).map_or(0, |last| last + 1);
             let free = used.next_multiple_of(SLOT);
             // A header, and a record.
@@ -272,6 +254,24 @@ impl Bench {
                 self.machine().load_bin(region.base, &bytes).expect("it is in flash");
             }
         }
+    }
+
+    /// The contents of memory, as a debug probe reads them.
+    ///
+    /// # Panics
+    /// If there is no memory.
+    pub fn memory(&self, address: u32, len: usize) -> Vec<u8> {
+        let mut bytes = vec![0; len];
+        self.world.machine(self.device).read_memory(address, &mut bytes).expect("memory");
+        bytes
+    }
+
+    /// A word of it.
+    ///
+    /// # Panics
+    /// If there is no memory.
+    pub fn word(&self, address: u32) -> u32 {
+        u32::from_le_bytes(self.memory(address, 4).try_into().expect("four bytes"))
     }
 
     /// Runs for this time.
@@ -361,11 +361,19 @@ impl Bench {
         self.start_program();
     }
 
-    /// Switches the board on: its bootloader has sent its boot-up.
+    /// Switches the board on: it has sent its boot-up message, at this time.
+    ///
+    /// # Panics
+    /// If it does not start.
+    pub fn switch_on(&mut self) -> Time {
+        self.power_on();
+        self.await_boot_up(1000)
+    }
+
+    /// The same with the board.
     #[must_use]
     pub fn switched_on(mut self) -> Self {
-        self.power_on();
-        self.await_boot_up(100);
+        self.switch_on();
         self
     }
 
@@ -387,9 +395,6 @@ impl Bench {
     }
 
     /// Protects the parameters against writing, as somebody could by the option bytes, or no longer.
-    ///
-    /// # Panics
-    /// Never: they are in flash.
     pub fn protect_parameters(&mut self, is_protected: bool) {
         let board = firmware::board();
         for region in board.parameters {
@@ -399,9 +404,6 @@ impl Bench {
     }
 
     /// Writes these words to the warm-start cell.
-    ///
-    /// # Panics
-    /// Never: it is in RAM.
     pub fn set_warm_start(&mut self, words: [u32; 4]) {
         let bytes = words.map(u32::to_le_bytes).concat();
         self.machine().write_ram(firmware::board().warm_start.base, &bytes).expect("it is in RAM");
@@ -442,7 +444,6 @@ impl Bench {
     }
 
     /// Every good frame that began at or after this time, as identifier and data.
-    #[must_use]
     pub fn frames_since(&self, from: Time) -> Vec<(Time, u32, Vec<u8>)> {
         let heard = self.heard.borrow();
         let good = heard.iter().filter(|record| record.start >= from && record.outcome == Outcome::Good);
@@ -450,20 +451,17 @@ impl Bench {
     }
 
     /// The same of the frames with this identifier.
-    #[must_use]
     pub fn frames_of(&self, id: u32, from: Time) -> Vec<(Time, Vec<u8>)> {
         let frames = self.frames_since(from).into_iter().filter(|(_, of, _)| *of == id);
         frames.map(|(at, _, data)| (at, data)).collect()
     }
 
     /// The emergencies of the board with [`NODE`].
-    #[must_use]
     pub fn emergencies(&self, from: Time) -> Vec<Vec<u8>> {
         self.frames_of(0x80 + u32::from(NODE), from).into_iter().map(|(_, data)| data).collect()
     }
 
     /// Every record of the bus so far, including errors.
-    #[must_use]
     pub fn records(&self) -> Vec<Record> {
         self.heard.borrow().clone()
     }
@@ -506,6 +504,12 @@ impl Bench {
         self.answer(answer)
     }
 
+    /// The same; the frame must be this one.
+    #[track_caller]
+    pub fn assert_answer(&mut self, id: u16, data: &[u8], answer: u32, expected: &[u8]) {
+        assert_eq!(self.ask(id, data, answer).as_deref(), Some(expected), "to {data:02X?}");
+    }
+
     /// The next frame with this identifier, within 100 ms.
     fn answer(&mut self, id: u32) -> Option<Vec<u8>> {
         let deadline = self.time() + Span::from_millis(100);
@@ -521,13 +525,11 @@ impl Bench {
     ///
     /// # Panics
     /// If it refuses the bit rate.
-    #[must_use]
     pub fn at_rate(rate: BitRate) -> Self {
         let mut bench = Self::new();
         bench.commission(bench.device, NODE, rate);
         bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
-        bench.power_on();
-        bench.await_boot_up(1000);
+        bench.switch_on();
         bench
     }
 
@@ -535,7 +537,6 @@ impl Bench {
     ///
     /// # Panics
     /// If it cannot be installed.
-    #[must_use]
     pub fn running(rate: BitRate, image: &str) -> Self {
         let mut bench = Self::at_rate(rate);
         bench.install(image);
@@ -551,6 +552,15 @@ impl Bench {
     pub fn install(&mut self, image: &str) -> Report {
         let options = FlashOptions::default().trial_run(false);
         flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {}).expect("it is installed")
+    }
+
+    /// The same without a watch over the program, which one that does not feed its watchdog does not outlive.
+    ///
+    /// # Errors
+    /// The board does not take it.
+    pub fn install_unwatched(&mut self, image: &str) -> Result<Report, Error> {
+        let options = FlashOptions::default().trial_run(false).watch(Some(Duration::ZERO));
+        flash(&mut self.session(), firmware::blocks(image), &options, &mut |_| {})
     }
 
     /// The whole procedure of the tool with its default options.
@@ -632,9 +642,6 @@ impl Bench {
     }
 
     /// A host's session with the board.
-    ///
-    /// # Panics
-    /// Never: the node-ID is valid.
     pub fn session(&mut self) -> Session<'_> {
         self.session_with(NODE)
     }
@@ -675,6 +682,19 @@ impl Bench {
 impl Default for Bench {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+/// The code of an abort; `None` for a success.
+///
+/// # Panics
+/// If it is another error.
+#[track_caller]
+pub fn abort_code<T>(outcome: Result<T, Error>) -> Option<u32> {
+    match outcome {
+        Ok(_) => None,
+        Err(Error::Refused { code, .. }) => Some(code.0),
+        Err(error) => panic!("{error}"),
     }
 }
 

@@ -56,10 +56,6 @@ pub struct Image {
 
 /// The images of `docs/eds/`: the bootloader with each profile and for sealed images, and the
 /// application template.
-///
-/// # Panics
-/// Never: the products exist.
-#[must_use]
 pub fn images() -> Vec<Image> {
     let bootloader = |name, sealed| bootloader_of(name, sealed).expect("a product of the repository");
     vec![
@@ -74,7 +70,6 @@ pub fn images() -> Vec<Image> {
 
 /// The bootloader of the chosen product (`cargo xtask eds --product`), also for sealed images if it may take
 /// them; `None` for the default product, which [`images`] has.
-#[must_use]
 pub fn chosen() -> Option<Vec<Image>> {
     let product = product::PRODUCT;
     let may_seal =
@@ -85,16 +80,11 @@ pub fn chosen() -> Option<Vec<Image>> {
 }
 
 /// The bootloader of the default product.
-///
-/// # Panics
-/// Never: the product exists.
-#[must_use]
 pub fn default_bootloader() -> Image {
     bootloader_of(DEFAULT, false).expect("a product of the repository")
 }
 
 /// The bootloader of a product in `bootloader/products`.
-#[must_use]
 pub fn bootloader_of(name: &str, sealed: bool) -> Option<Image> {
     let (_, product) = products::ALL.iter().find(|(product, _)| *product == name)?;
     Some(bootloader(name, &product.clone().checked(), sealed))
@@ -143,7 +133,6 @@ const DESCRIPTION: &str = "coboot, the CANopen bootloader";
 
 /// The application template, version 1. The tests compare these values with its `objects.rs` over
 /// the bus.
-#[must_use]
 pub fn application() -> Image {
     Image {
         file: "coboot-application.eds".to_owned(),
@@ -175,7 +164,6 @@ const BOARD: Device = Device {
 
 impl Image {
     /// The EDS file.
-    #[must_use]
     pub fn eds(&self) -> String {
         let mut eds = Ini(String::new());
         self.about(&mut eds);
@@ -202,7 +190,6 @@ impl Image {
     }
 
     /// The indices of all objects, ascending.
-    #[must_use]
     pub fn indices(&self) -> Vec<u16> {
         let mut indices: Vec<u16> = self.entries.iter().map(|entry| entry.at.index).collect();
         indices.sort_unstable();

@@ -29,7 +29,6 @@ impl Endpoint {
     ///
     /// # Panics
     /// If no port is free.
-    #[must_use]
     pub fn new(bench: Bench) -> Self {
         let server = Server::bind("127.0.0.1:0", "can0").expect("a free port");
         Self { bench, server, serial: None, speed: 1.0 }
@@ -40,7 +39,6 @@ impl Endpoint {
     ///
     /// # Panics
     /// If no port is free.
-    #[must_use]
     pub fn slower(bench: Bench, factor: u32) -> Self {
         Self { speed: f64::from(factor).recip(), ..Self::new(bench) }
     }
@@ -50,7 +48,6 @@ impl Endpoint {
     /// # Panics
     /// If the system provides none.
     #[cfg(unix)]
-    #[must_use]
     pub fn serial(mut bench: Bench) -> Self {
         let usart = bench.usart().instance().name;
         let serial = Serial::terminal(usart).expect("a pseudo-terminal");
@@ -58,13 +55,11 @@ impl Endpoint {
     }
 
     /// `HOST:PORT` of the endpoint.
-    #[must_use]
     pub fn address(&self) -> String {
         self.server.address().to_string()
     }
 
     /// Its URL for coflash.
-    #[must_use]
     pub fn url(&self) -> String {
         match &self.serial {
             Some(serial) => format!("slcan:{}@125k", serial.place()),

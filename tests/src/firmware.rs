@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use coflash_core::file::convert::{program_of, Options, Region};
-use coflash_core::file::read::{read, Firmware};
+use coflash_core::file::read::{read, Firmware, Format};
 use coflash_core::file::Program;
 use coflash_core::update::JOINED_BLOCKS;
 use object::read::elf::ElfFile32;
@@ -77,7 +77,6 @@ pub const APP_C_PROBE_PROGRAM_2: &str = "app-c-probe-program-2.elf";
 ///
 /// # Panics
 /// If there is none.
-#[must_use]
 pub fn symbol(image: &str, is: impl Fn(&str) -> bool) -> u32 {
     use object::{Object as _, ObjectSymbol as _};
     let elf = elf(image);
@@ -88,7 +87,6 @@ pub fn symbol(image: &str, is: impl Fn(&str) -> bool) -> u32 {
 }
 
 /// The name of an image for another board than the tested one.
-#[must_use]
 pub fn of_board(board: &str, image: &str) -> String {
     format!("../{board}/{image}")
 }
@@ -97,7 +95,6 @@ pub fn of_board(board: &str, image: &str) -> String {
 ///
 /// # Panics
 /// If the board does not exist.
-#[must_use]
 pub fn board() -> &'static Layout {
     match env::var("COBOOT_BOARD") {
         Ok(name) => {
@@ -108,13 +105,11 @@ pub fn board() -> &'static Layout {
 }
 
 /// Where the first program begins in the flash of the board, in bytes from the start of the flash.
-#[must_use]
 pub fn program_offset() -> usize {
     (board().programs[0].base - board().chip.flash.base) as usize
 }
 
 /// The folder of the images: `COBOOT_FIRMWARE_DIR`, or the default folder of `cargo xtask build`.
-#[must_use]
 pub fn dir() -> PathBuf {
     env::var_os("COBOOT_FIRMWARE_DIR").map_or_else(
         || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../target/firmware").join(board().board),
@@ -126,7 +121,6 @@ pub fn dir() -> PathBuf {
 ///
 /// # Panics
 /// If it was not built, or does not match the board.
-#[must_use]
 pub fn blocks(name: &str) -> Program {
     let _ = elf(name);
     blocks_of_file(&dir().join(name))
@@ -136,7 +130,6 @@ pub fn blocks(name: &str) -> Program {
 ///
 /// # Panics
 /// As [`blocks`].
-#[must_use]
 pub fn large_blocks(name: &str) -> Program {
     let _ = elf(name);
     blocks_with(&dir().join(name), Options::default().block_size(JOINED_BLOCKS))
@@ -146,7 +139,6 @@ pub fn large_blocks(name: &str) -> Program {
 ///
 /// # Panics
 /// If it is none, or does not fit the board.
-#[must_use]
 pub fn blocks_of_file(elf: &Path) -> Program {
     blocks_with(elf, Options::default())
 }
@@ -157,11 +149,31 @@ fn blocks_with(elf: &Path, options: Options) -> Program {
     program_of(image, &options).expect("it lies in the program's flash").program
 }
 
+/// A raw image of program 1 as the blocks for the device.
+///
+/// # Panics
+/// If it does not fit.
+pub fn blocks_of_raw(bytes: &[u8]) -> Program {
+    let place = board().programs[0];
+    let image = read(bytes, Some(Format::Raw), Some(place.base)).expect("bytes at an address");
+    let options = Options::default().region(Region::Strict(place.into()));
+    program_of(image, &options).expect("it fits").program
+}
+
+/// A branch to itself (ARMv7-M A7.7.12).
+pub const HERE: [u8; 2] = 0xE7FE_u16.to_le_bytes();
+
+/// A program without effects, a vector table and a loop; with the address of the loop.
+pub fn endless_loop() -> (u32, Program) {
+    let mut image = made_up(0x400, |_| 0);
+    image[0x200..0x202].copy_from_slice(&HERE);
+    (board().programs[0].base + 0x200, blocks_of_raw(&image))
+}
+
 /// An application as a raw image: its bytes from the start of the first program; gaps are FFh.
 ///
 /// # Panics
 /// If it was not built, or does not begin there.
-#[must_use]
 pub fn raw(name: &str) -> Vec<u8> {
     raw_from(board().programs[0].base, name)
 }
@@ -170,7 +182,6 @@ pub fn raw(name: &str) -> Vec<u8> {
 ///
 /// # Panics
 /// As [`raw`].
-#[must_use]
 pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
     let Firmware::Image(image) = read(&elf(name), None, None).expect("an ELF of ours") else {
         panic!("an ELF is no block file");
@@ -188,7 +199,6 @@ pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
 ///
 /// # Panics
 /// If the image is shorter than that.
-#[must_use]
 pub fn with_label(mut image: Vec<u8>, label: &Label) -> Vec<u8> {
     image[label::OFFSET as usize..][..label::SIZE].copy_from_slice(&label.emit());
     image
@@ -198,7 +208,6 @@ pub fn with_label(mut image: Vec<u8>, label: &Label) -> Vec<u8> {
 ///
 /// # Panics
 /// If it was not built; the message gives the command.
-#[must_use]
 pub fn elf(name: &str) -> Vec<u8> {
     let folder = dir();
     fs::read(folder.join(name)).unwrap_or_else(|error| {
@@ -212,7 +221,6 @@ pub fn elf(name: &str) -> Vec<u8> {
 
 /// Bytes that a bootloader accepts as the start of program 1: initial stack pointer in RAM, reset
 /// vector inside, the other bytes are `byte`.
-#[must_use]
 pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
     let (ram, program) = (board().ram, board().programs[0]);
     let mut bytes: Vec<u8> = (0..len).map(byte).collect();
@@ -225,7 +233,6 @@ pub fn made_up(len: usize, byte: impl Fn(usize) -> u8) -> Vec<u8> {
 ///
 /// # Panics
 /// If it is not an ELF file, or has no such section.
-#[must_use]
 pub fn section(elf: &[u8], name: &str) -> (u32, Vec<u8>) {
     let file = ElfFile32::<Endianness>::parse(elf).expect("an ELF file");
     let section = file.section_by_name(name).unwrap_or_else(|| panic!("no section {name}"));

@@ -34,7 +34,6 @@ pub struct Update {
 
 impl Update {
     /// The number of devices that are done.
-    #[must_use]
     pub fn done(&self) -> usize {
         self.results.iter().filter(|result| result.is_ok()).count()
     }
@@ -76,7 +75,6 @@ impl Fleet {
     ///
     /// # Panics
     /// If a board refuses its node-ID, or the firmware was not built.
-    #[must_use]
     pub fn new(boards: u8, rate: BitRate) -> Self {
         Self::of_image(firmware::BOOTLOADER, boards, rate)
     }
@@ -85,7 +83,6 @@ impl Fleet {
     ///
     /// # Panics
     /// As [`new`](Self::new).
-    #[must_use]
     pub fn of_image(bootloader: &str, boards: u8, rate: BitRate) -> Self {
         let mut bench = Bench::of_boards_with(bootloader, boards.into());
         for (board, node) in bench.boards().into_iter().zip(1..) {
@@ -160,7 +157,6 @@ impl Fleet {
 }
 
 /// The application, extended to so many KiB, in blocks of the default size.
-#[must_use]
 pub fn file(kib: u32) -> Arc<Program> {
     Arc::new(blocks(&program(kib), DEFAULT_BLOCK_SIZE))
 }

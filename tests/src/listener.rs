@@ -18,19 +18,16 @@ pub enum Listener {
 
 impl Listener {
     /// A debug probe that reads text.
-    #[must_use]
     pub fn probe() -> Self {
         Self::Probe(Reader::default())
     }
 
     /// A debug probe that reads frames of `defmt` with the help of an image's ELF file.
-    #[must_use]
     pub fn probe_of(image: &str) -> Self {
         Self::Probe(Reader::with(Some(decoder(image))))
     }
 
     /// A terminal at the board's UART.
-    #[must_use]
     pub const fn terminal() -> Self {
         Self::Terminal(Vec::new())
     }
@@ -71,7 +68,6 @@ pub fn heard(machine: &mut Machine) -> Vec<Character> {
 ///
 /// # Panics
 /// If the image has none.
-#[must_use]
 pub fn decoder(image: &str) -> Decoder {
     Decoder::of_elf(&firmware::elf(image)).expect("words that are understood").expect("words")
 }

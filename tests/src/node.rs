@@ -60,7 +60,6 @@ impl NodeBus {
     ///
     /// # Panics
     /// If the file cannot be created.
-    #[must_use]
     pub fn new(test: &str) -> Self {
         let folder = Folder::below(env::temp_dir(), test);
         let flash = FileFlash::open(&folder.join("node.flash"), &LAYOUT, Speed::Instant).expect("a file");

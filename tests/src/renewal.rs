@@ -17,13 +17,11 @@ use crate::bench::Bench;
 use crate::firmware;
 
 /// The program number of the bootloader of the tested board: it follows those of the layout.
-#[must_use]
 pub fn number() -> u8 {
     shared_abi::renewal::number(firmware::board().programs.len() as u8, None)
 }
 
 /// The RAM image of a built bootloader, with its header.
-#[must_use]
 pub fn image_of(bootloader: &str) -> Vec<u8> {
     let elf = firmware::elf(bootloader);
     let (_, header) = firmware::section(&elf, ".ram_image");
@@ -32,7 +30,6 @@ pub fn image_of(bootloader: &str) -> Vec<u8> {
 }
 
 /// The image with the right CRC in its header.
-#[must_use]
 pub fn with_crc(mut image: Vec<u8>) -> Vec<u8> {
     let crc = crc32(&image[8..]);
     image[4..8].copy_from_slice(&crc.to_le_bytes());
@@ -40,7 +37,6 @@ pub fn with_crc(mut image: Vec<u8>) -> Vec<u8> {
 }
 
 /// A built image with another word in its header.
-#[must_use]
 pub fn with_word(bootloader: &str, at: usize, word: u32) -> Vec<u8> {
     let mut image = image_of(bootloader);
     image[at..at + 4].copy_from_slice(&word.to_le_bytes());
@@ -48,7 +44,6 @@ pub fn with_word(bootloader: &str, at: usize, word: u32) -> Vec<u8> {
 }
 
 /// A built image with another version.
-#[must_use]
 pub fn version(bootloader: &str, version: u32) -> Vec<u8> {
     with_word(bootloader, 48, version)
 }
@@ -57,7 +52,6 @@ pub fn version(bootloader: &str, version: u32) -> Vec<u8> {
 ///
 /// # Panics
 /// If the image has no header.
-#[must_use]
 pub fn plain(image: &[u8]) -> Payload {
     let Ok(Firmware::Image(image)) = read(image, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
     RamImage::find(&image).expect("a RAM image").into()
@@ -67,7 +61,6 @@ pub fn plain(image: &[u8]) -> Payload {
 ///
 /// # Panics
 /// If the image has no header.
-#[must_use]
 pub fn crc_of(image: &[u8]) -> u32 {
     u32::from_le_bytes(image[4..8].try_into().expect("four bytes"))
 }
@@ -146,8 +139,6 @@ pub fn identification(bench: &mut Bench) -> u32 {
 ///
 /// # Panics
 /// If it is outside the chip.
-pub fn cells(bench: &mut Bench, place: Region) -> Vec<u8> {
-    let mut bytes = vec![0; place.size as usize];
-    bench.machine().read_memory(place.base, &mut bytes).expect("an answer");
-    bytes
+pub fn cells(bench: &Bench, place: Region) -> Vec<u8> {
+    bench.memory(place.base, place.size as usize)
 }

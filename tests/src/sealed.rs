@@ -39,13 +39,11 @@ pub struct Device {
 
 impl Device {
     /// A device with this flash.
-    #[must_use]
     pub fn on(setup: &'static Setup, flash: ModelFlash) -> Self {
         Self { setup, chip: Chip::new(flash), buffer: 2048 }
     }
 
     /// A device with empty flash except this key block.
-    #[must_use]
     pub fn with_keys(setup: &'static Setup, block: &[u8; 256]) -> Self {
         let mut flash = ModelFlash::new(&CHIP);
         flash.poke(setup.layout.key_block().base, block);
@@ -53,19 +51,16 @@ impl Device {
     }
 
     /// A device with empty flash except [`default_keys`].
-    #[must_use]
     pub fn sealed(setup: &'static Setup) -> Self {
         Self::with_keys(setup, &default_keys())
     }
 
     /// A device with empty flash.
-    #[must_use]
     pub fn open(setup: &'static Setup) -> Self {
         Self::on(setup, ModelFlash::new(&CHIP))
     }
 
     /// Another device with the same flash contents.
-    #[must_use]
     pub fn copy(&self) -> Self {
         let mut flash = self.chip.model().clone();
         flash.power_on();
@@ -103,19 +98,16 @@ impl Device {
     }
 
     /// The record of a program.
-    #[must_use]
     pub fn record(&self, program: u8) -> Option<ProgramRecord> {
         ProgramRecord::load(&self.parameters(), &self.chip, program)
     }
 
     /// The lowest counter stored for a program.
-    #[must_use]
     pub fn counter(&self, program: u8) -> u32 {
         self.parameters().get(&self.chip, Key::counter(program)).map_or(0, |[counter, ..]| counter)
     }
 
     /// The program that the boot stage starts.
-    #[must_use]
     pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
         match choice(&self.chip, &self.parameters(), self.setup.layout, ResetCause::PowerOn, request).exit {
             Exit::Program(Start { number, .. }) => Some(number),
@@ -124,7 +116,6 @@ impl Device {
     }
 
     /// The first bytes of a program's flash.
-    #[must_use]
     pub fn cells(&self, program: u8, len: usize) -> Vec<u8> {
         let base = self.setup.region(program).base;
         self.chip.model().cells(Region::new(base, len as u32)).to_vec()
@@ -141,7 +132,6 @@ impl Device {
 
     /// The regions that were erased or written since the last call, except the journal, which
     /// records events.
-    #[allow(clippy::must_use_candidate, reason = "it forgets, too")]
     pub fn take_touched(&self) -> Vec<Region> {
         let mut touched = std::mem::take(&mut self.chip.model().touched);
         let journal = self.setup.layout.parameters;
@@ -150,7 +140,6 @@ impl Device {
     }
 
     /// Whether the flash of a program was changed since the last call.
-    #[must_use]
     pub fn was_touched(&self, program: u8) -> bool {
         let region = self.setup.region(program);
         self.take_touched().iter().any(|touched| region.contains(touched.base, touched.size))

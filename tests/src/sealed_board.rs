@@ -7,9 +7,8 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coflash_core::device::{Doing, Transfers};
 use coflash_core::file::sealed::{key_block, Certificate, Kek, Role, Sealer, SigningKey};
-use coflash_core::Error;
 
-use crate::bench::Bench;
+use crate::bench::{abort_code, Bench};
 use crate::firmware;
 
 /// 1F50h/1 and 1F57h/1.
@@ -57,35 +56,27 @@ pub const KEK: [u8; 32] = {
 };
 
 /// A signing key from a seed.
-///
-/// # Panics
-/// Never for the seeds of these tests: no id is 0.
-#[must_use]
 pub fn key(seed: u8) -> SigningKey {
     SigningKey::from_seed([seed; 32]).expect("its id is not 0")
 }
 
 /// The root of the devices.
-#[must_use]
 pub fn root() -> SigningKey {
     key(1)
 }
 
 /// The key that signs programs, certified by [`root`].
-#[must_use]
 pub fn release() -> SigningKey {
     key(2)
 }
 
 /// A program for the board's product with this security counter, neither compressed nor encrypted,
 /// to be signed by [`release`].
-#[must_use]
 pub fn sealer(counter: u32) -> Sealer<'static> {
     sealer_of_epoch(counter, 1)
 }
 
 /// The same, with a certificate of this epoch.
-#[must_use]
 pub fn sealer_of_epoch(counter: u32, epoch: u32) -> Sealer<'static> {
     let bsp::Identity { vendor_id, product_code, .. } = bsp::IDENTITY;
     let certificate = Certificate {
@@ -105,7 +96,6 @@ pub fn sealer_of_epoch(counter: u32, epoch: u32) -> Sealer<'static> {
 ///
 /// # Panics
 /// If the firmware was not built.
-#[must_use]
 pub fn board() -> Bench {
     board_of(firmware::BOOTLOADER_SEALED)
 }
@@ -114,7 +104,6 @@ pub fn board() -> Bench {
 ///
 /// # Panics
 /// If the firmware was not built.
-#[must_use]
 pub fn board_of(bootloader: &str) -> Bench {
     let mut bench = Bench::of_image(bootloader);
     provision(&mut bench);
@@ -122,25 +111,17 @@ pub fn board_of(bootloader: &str) -> Bench {
 }
 
 /// Writes the keys into a board, as in production: it is a sealed device after its next reset.
-///
-/// # Panics
-/// Never: the place of the keys is in flash.
 pub fn provision(bench: &mut Bench) {
     let place = firmware::board().key_block();
     bench.machine().load_bin(place.base, &keys()).expect("it is in flash");
 }
 
 /// The key block of the devices.
-///
-/// # Panics
-/// Never: there is one root and one key.
-#[must_use]
 pub fn keys() -> [u8; 256] {
     key_block(&[root().public()], &*KEKS, COUNTER, 0, false).expect("one root and one key")
 }
 
 /// The same without keys: a device that is not sealed.
-#[must_use]
 pub fn open_board() -> Bench {
     Bench::of_image(firmware::BOOTLOADER_SEALED)
 }
@@ -164,11 +145,7 @@ pub fn write_to(bench: &mut Bench, program: u8, file: &[u8], transfers: Transfer
     session.command(program, ProgramControl::Clear).expect("CLEAR is answered");
     session.await_idle(program, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
     let data = Address { sub: program, ..DATA };
-    let abort = match session.write(data, file, Doing::Program, &mut |_| {}) {
-        Ok(()) => None,
-        Err(Error::Refused { code, .. }) => Some(code.0),
-        Err(error) => panic!("{error}"),
-    };
+    let abort = abort_code(session.write(data, file, Doing::Program, &mut |_| {}));
     let status = session.await_idle(program, Doing::Read(STATUS)).expect("1F57h is answered");
     (abort, status.to_word())
 }

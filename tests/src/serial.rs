@@ -130,7 +130,6 @@ struct Heard {
 
 impl TextBus {
     /// The UART of the first board of a bench.
-    #[must_use]
     pub fn new(bench: Bench) -> Self {
         Self { bench, line: (Time(0), String::new()), heard: Vec::new(), given: 0 }
     }

@@ -16,7 +16,6 @@ const ALLOC: u64 = 2;
 ///
 /// # Panics
 /// If the image was not built, or has no statics in RAM.
-#[must_use]
 pub fn of_image(image: &str) -> Region {
     let elf = firmware::elf(image);
     let file = ElfFile32::<Endianness>::parse(&*elf).expect("an ELF file");
@@ -44,7 +43,6 @@ pub fn fill(machine: &mut Machine, stack: Region) {
 ///
 /// # Panics
 /// If the stack is not in RAM.
-#[must_use]
 pub fn depth(machine: &Machine, stack: Region) -> u32 {
     let mut found = vec![0; stack.size as usize];
     machine.read_memory(stack.base, &mut found).expect("it is in RAM");

@@ -55,7 +55,6 @@ impl Measurement {
     }
 
     /// The efficiency in percent.
-    #[must_use]
     pub fn percent(&self) -> u64 {
         self.limit() * 100 / self.took.max(1)
     }
@@ -65,7 +64,6 @@ impl Measurement {
 ///
 /// # Panics
 /// If the device refuses it, or the firmware was not built.
-#[must_use]
 pub fn measure(rate: BitRate, kib: u32) -> Measurement {
     let (mut bench, bit_rate) = board_at(rate);
     let bytes = program(kib);
@@ -135,7 +133,6 @@ pub struct OfForm {
 
 impl OfForm {
     /// The duration in percent of the raw program's time on the wire.
-    #[must_use]
     pub fn percent(&self) -> u64 {
         self.took * 100 / self.wire.max(1)
     }
@@ -145,7 +142,6 @@ impl OfForm {
 ///
 /// # Panics
 /// If the device refuses it, or the firmware was not built.
-#[must_use]
 pub fn measure_form(rate: BitRate, kib: u32, form: Form) -> OfForm {
     let mut bench = sealed_board::open_board();
     let bit_rate = change_over(&mut bench, rate);
@@ -173,7 +169,6 @@ pub fn measure_form(rate: BitRate, kib: u32, form: Form) -> OfForm {
 ///
 /// # Panics
 /// If it was not built.
-#[must_use]
 pub fn code(kib: u32) -> Vec<u8> {
     let mut bytes = firmware::raw(firmware::APP_V1);
     let words: Vec<[u8; 2]> = bytes.chunks_exact(2).map(|word| [word[0], word[1]]).collect();
@@ -205,7 +200,6 @@ pub struct Load {
 
 impl Load {
     /// The load, in percent.
-    #[must_use]
     pub fn percent(&self) -> u64 {
         self.busy * 100 / self.took.max(1)
     }
@@ -217,7 +211,6 @@ impl Load {
 ///
 /// # Panics
 /// If the device refuses it, or the firmware was not built.
-#[must_use]
 pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
     let (mut bench, bit_rate) = board_at(rate);
     let file = blocks(&program(kib), block_size);
@@ -242,7 +235,6 @@ pub fn load(rate: BitRate, kib: u32, block_size: usize) -> Load {
 ///
 /// # Panics
 /// If it was not built.
-#[must_use]
 pub fn program(kib: u32) -> Vec<u8> {
     let image = firmware::raw(firmware::APP_V1);
     let mut bytes: Vec<u8> =

@@ -8,7 +8,6 @@ use std::process::{Command, Output};
 ///
 /// # Panics
 /// If the variable is not set.
-#[must_use]
 pub fn given(variable: &str) -> PathBuf {
     let path = env::var_os(variable);
     path.unwrap_or_else(|| panic!("{variable} is not set: run the tests by `cargo xtask test`")).into()
@@ -18,7 +17,6 @@ pub fn given(variable: &str) -> PathBuf {
 ///
 /// # Panics
 /// If the tests do not run by `cargo xtask test`.
-#[must_use]
 pub fn coflash() -> Command {
     let mut coflash = Command::new(given("COBOOT_COFLASH"));
     coflash.env_remove("COFLASH_CONFIG");
@@ -29,7 +27,6 @@ pub fn coflash() -> Command {
 ///
 /// # Panics
 /// As [`coflash`].
-#[must_use]
 pub fn python() -> Command {
     Command::new(given("COBOOT_PYTHON"))
 }
@@ -38,7 +35,6 @@ pub fn python() -> Command {
 ///
 /// # Panics
 /// As [`coflash`].
-#[must_use]
 pub fn script(name: &str) -> Command {
     let mut python = python();
     python.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name));
@@ -46,7 +42,6 @@ pub fn script(name: &str) -> Command {
 }
 
 /// What a program has printed, first on standard output and then on standard error.
-#[must_use]
 pub fn text(output: &Output) -> String {
     String::from_utf8_lossy(&[&output.stdout[..], &output.stderr].concat()).into_owned()
 }
@@ -56,7 +51,6 @@ pub fn text(output: &Output) -> String {
 /// # Panics
 /// If it has failed; the message has its output.
 #[track_caller]
-#[must_use]
 pub fn succeeded(output: &Output) -> String {
     assert!(output.status.success(), "{}: {}", output.status, text(output));
     text(output)

@@ -20,8 +20,6 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::serial::{Serial, SerialLine};
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::convert::{program_of, Options, Region};
-use coflash_core::file::read::{read, Firmware, Format};
 use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as Chip;
@@ -49,11 +47,7 @@ impl Serial for &mut Board {
 fn version(more: usize) -> Program {
     let mut bytes = firmware::raw(firmware::APP_VIRTUAL_CAN);
     bytes.extend((0..more).map(|n| (n * 31 / 8) as u8));
-    let base = firmware::board().programs[0].base;
-    let image = read(&bytes, Some(Format::Raw), Some(base)).expect("bytes at an address");
-    assert!(matches!(image, Firmware::Image(_)));
-    let options = Options::default().region(Region::Strict(firmware::board().programs[0].into()));
-    program_of(image, &options).expect("it fits").program
+    firmware::blocks_of_raw(&bytes)
 }
 
 /// Installs, starts, calls back, updates and calls back again; returns what the device says.

@@ -20,7 +20,6 @@ pub struct Boot {
 
 impl Boot {
     /// A device with the serial number 0 that was asked to stay.
-    #[must_use]
     pub fn new(config: &'static Config, node: NodeParameters) -> Self {
         Self {
             config,
@@ -59,7 +58,6 @@ impl Boot {
 const TAKES_SEALED: &str = "COBOOT_TAKES_SEALED";
 
 /// A buffer for blocks, and the memory for sealed images, for a bootloader that lives as long as the test.
-#[must_use]
 pub fn leaked(buffer: usize) -> (&'static mut [u8], Sealed<'static>) {
     let takes_sealed = std::env::var_os(TAKES_SEALED).is_some();
     let sealed = if takes_sealed { Box::leak(Box::<SealedMemory>::default()).sealed() } else { Sealed::NONE };

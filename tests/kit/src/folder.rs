@@ -23,7 +23,6 @@ impl Folder {
     ///
     /// # Panics
     /// When it cannot be made.
-    #[must_use]
     pub fn below(folder: impl AsRef<Path>, name: &str) -> Self {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -57,7 +56,6 @@ impl Folder {
     ///
     /// # Panics
     /// When the path is not UTF-8.
-    #[must_use]
     pub fn path(&self, name: &str) -> String {
         self.0.join(name).to_str().expect("a path in UTF-8").to_owned()
     }
@@ -94,7 +92,6 @@ impl Alone {
     ///
     /// # Panics
     /// When the folder of this file, or the file, cannot be made.
-    #[must_use]
     pub fn at(file: &Path) -> Self {
         let locked = || {
             fs::create_dir_all(file.parent().unwrap_or(file))?;

@@ -4,7 +4,6 @@
 use std::fmt::Write;
 
 /// One record: length, offset, type, data, and the two's complement of their sum.
-#[must_use]
 pub fn record(offset: u16, kind: u8, data: &[u8]) -> String {
     let mut bytes = vec![data.len() as u8];
     bytes.extend(offset.to_be_bytes());
@@ -23,7 +22,6 @@ pub const END_OF_FILE: &str = ":00000001FF";
 
 /// Bytes from this address on, in records of 16, with a linear base record where the upper half of
 /// the address changes.
-#[must_use]
 pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
     let mut text = String::new();
     for (address, data) in (base..).step_by(16).zip(bytes.chunks(16)) {

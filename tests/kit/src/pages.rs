@@ -29,7 +29,6 @@ const FOREIGN: [&str; 4] = ["target", ".git", "corpus", "node_modules"];
 ///
 /// # Panics
 /// When a page cannot be read.
-#[must_use]
 pub fn commands() -> Vec<Shown> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().find(|folder| folder.join("docs").is_dir());
     let root = root.expect("a crate lies in the workspace");
@@ -145,7 +144,6 @@ fn words(line: &str) -> Vec<String> {
 }
 
 /// The arguments of a program, if the command runs it: by its name, or by `cargo run -p NAME --`.
-#[must_use]
 pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
     match words {
         [name, arguments @ ..] if name == program => Some(arguments),
@@ -159,7 +157,6 @@ pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
 }
 
 /// A word in capitals is a placeholder: for a command, a board, a file.
-#[must_use]
 pub fn is_placeholder(word: &str) -> bool {
     !word.is_empty() && word.bytes().all(|byte| byte.is_ascii_uppercase() || byte == b'_')
 }

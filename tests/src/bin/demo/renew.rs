@@ -1,14 +1,11 @@
 //! The renewal of the bootloader as a demonstration: `cargo xtask demo --renew`.
 
 use bsp::can::BitTiming;
-use canopen::program::{ProgramControl, ProgramStart, DEVICE_STATE, STATE_PROGRAM_START};
-use canopen::Address;
+use canopen::program::{ProgramStart, DEVICE_STATE, STATE_PROGRAM_START};
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
-use coboot_tests::renewal::{image_of, with_crc};
+use coboot_tests::renewal::{image_of, plain, with_crc};
 use coboot_tests::sealed_board;
-use coflash_core::file::ram_image::RamImage;
-use coflash_core::file::read::{read, Firmware, Format};
 use coflash_core::update::{flash, Event, FlashOptions, Payload};
 use emulator::machine::{Cut, FlashCut};
 
@@ -17,18 +14,17 @@ use crate::steps::{chapter, convert, install, introduce, print_line, Outcome};
 /// A bootloader is exchanged over CAN; a broken one ends by itself; the power fails.
 pub fn run(bench: &mut Bench) -> Outcome<()> {
     chapter("A board runs version 1 of its program");
-    bench.power_on();
-    bench.await_boot_up(1000);
+    bench.switch_on();
     install(bench, &convert(firmware::APP_V1))?;
     introduce(bench)?;
 
     chapter("A new bootloader: it starts programs with a watchdog of a second");
-    renewed(bench, &bootloader(image_of(firmware::BOOTLOADER_WATCHDOG))?)?;
+    renewed(bench, &plain(&image_of(firmware::BOOTLOADER_WATCHDOG)))?;
     introduce(bench)?;
     call_back(bench)?;
 
     chapter("A broken bootloader: its bit rate is wrong, so nobody can reach it");
-    let broken = bootloader(with_wrong_bit_rate(image_of(firmware::BOOTLOADER))?)?;
+    let broken = plain(&with_wrong_bit_rate(image_of(firmware::BOOTLOADER))?);
     match renewed(bench, &broken) {
         Ok(()) => return Err("the device has installed it".into()),
         Err(error) => print_line(bench.time(), &error.to_string()),
@@ -36,7 +32,7 @@ pub fn run(bench: &mut Bench) -> Outcome<()> {
     introduce(bench)?;
 
     chapter("The power fails while the device installs another bootloader");
-    let next = bootloader(image_of(firmware::BOOTLOADER))?;
+    let next = plain(&image_of(firmware::BOOTLOADER));
     let words = image_of(firmware::BOOTLOADER).len() as u64 / 4;
     bench
         .machine()
@@ -58,8 +54,7 @@ pub fn run(bench: &mut Bench) -> Outcome<()> {
 
     chapter("A sealed device, and a bootloader that nobody has signed");
     let mut sealed = sealed_board::board();
-    sealed.power_on();
-    sealed.await_boot_up(1000);
+    sealed.switch_on();
     match renewed(&mut sealed, &next) {
         Ok(()) => Err("the device took it".into()),
         Err(error) => {
@@ -67,13 +62,6 @@ pub fn run(bench: &mut Bench) -> Outcome<()> {
             introduce(&mut sealed)
         }
     }
-}
-
-fn bootloader(bytes: Vec<u8>) -> Outcome<Payload> {
-    let Firmware::Image(image) = read(&bytes, Some(Format::Raw), Some(0))? else {
-        return Err("a raw file is an image".into());
-    };
-    Ok(RamImage::find(&image).ok_or("there is no RAM image")?.into())
 }
 
 /// The whole procedure of the tool, printed step by step.
@@ -88,14 +76,11 @@ fn renewed(bench: &mut Bench, new: &Payload) -> Outcome<()> {
 }
 
 fn call_back(bench: &mut Bench) -> Outcome<()> {
-    bench.session().command(1, ProgramControl::StartBootloader)?;
-    bench.await_boot_up(1000);
-    let start = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START))?;
-    let watchdog = ProgramStart::of_word(start).watchdog_ms;
+    bench.call_back();
+    let watchdog = ProgramStart::of_word(bench.number(DEVICE_STATE, STATE_PROGRAM_START)).watchdog_ms;
     print_line(bench.time(), &format!("watchdog of a program (2007h/10): {watchdog} ms"));
     introduce(bench)?;
-    bench.session().command(1, ProgramControl::Start)?;
-    bench.await_boot_up(1000);
+    bench.start_program();
     if bench.is_bootloader(NODE) {
         return Err("the program does not start".into());
     }
