@@ -94,7 +94,7 @@ int main(void)
 }
 "#;
 
-fn include() -> PathBuf {
+pub fn include() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot")
 }
 
@@ -106,11 +106,11 @@ fn strict(compiler: &str) -> Command {
     compiler
 }
 
-fn clang() -> Command {
+pub fn clang() -> Command {
     strict(&env::var("CLANG").unwrap_or_else(|_| "clang".into()))
 }
 
-fn succeed(command: &mut Command) -> String {
+pub fn succeed(command: &mut Command) -> String {
     let output = command.output().unwrap_or_else(|error| {
         panic!("{command:?}: {error}. `cargo xtask setup` installs the compilers.");
     });

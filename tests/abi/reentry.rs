@@ -1,13 +1,13 @@
 //! The way back in C (`examples/c/coboot/reentry.c`) beside that in Rust (`coboot_app::departure`): whatever
 //! comes, in whatever order, both do the same.
 
-use std::env;
 use std::fmt::Write as _;
-use std::path::Path;
 use std::process::Command;
 
 use coboot_app::departure::{Departure, Next};
 use kit::random::Random;
+
+use crate::header::{clang, include, succeed};
 
 /// Reads a script of events, and prints what the program does about each: for `b REQUEST NOW`, a command
 /// that was taken, whether it is possible; for `p QUIET NOW`, the next step, and in the end the request.
@@ -155,17 +155,12 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
     let folder = kit::folder!("reentry");
     let (source, events) = (folder.write("harness.c", HARNESS), folder.write("events", script));
     let program = folder.join("harness");
-    let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot");
-    let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
-    clang.args(["-std=c11", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]);
-    clang.args(["-fsanitize=undefined", "-fsanitize-trap=undefined"]);
-    clang.arg("-I").arg(&library).arg(&source).arg(library.join("reentry.c")).arg("-o").arg(&program);
-    clang.args(["-no-pie", "-Wl,--defsym=__programs=1"]);
-    let output = clang.output().expect("`cargo xtask setup` installs clang");
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let output = Command::new(&program).arg(&events).output().expect("it was just built");
-    assert!(output.status.success());
-    let printed = String::from_utf8(output.stdout).unwrap();
+    let library = include();
+    let mut compiler = clang();
+    compiler.args(["-std=c11", "-O1", "-fsanitize=undefined", "-fsanitize-trap=undefined"]);
+    compiler.arg(&source).arg(library.join("reentry.c")).arg("-o").arg(&program);
+    succeed(compiler.args(["-no-pie", "-Wl,--defsym=__programs=1"]));
+    let printed = succeed(Command::new(&program).arg(&events));
     let mut in_c: Vec<_> = printed.lines().collect();
     // As `coboot_app::ProgramControl`: owed by program 1, for no node.
     assert_eq!(in_c.pop(), Some("answers 7 1"));

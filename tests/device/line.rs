@@ -36,19 +36,10 @@ fn configuration_state(bench: &mut Bench) {
     bench.post(LSS_REQUEST, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
 }
 
-/// Configures and stores the settings, without other changes.
-fn store(bench: &mut Bench, node: u8, rate: BitRate) {
-    configuration_state(bench);
-    assert_eq!(lss(bench, [0x11, node, 0, 0, 0, 0, 0, 0]), [0x11, 0, 0, 0, 0, 0, 0, 0]);
-    assert_eq!(lss(bench, [0x13, 0, rate as u8, 0, 0, 0, 0, 0]), [0x13, 0, 0, 0, 0, 0, 0, 0]);
-    assert_eq!(lss(bench, [0x17, 0, 0, 0, 0, 0, 0, 0]), [0x17, 0, 0, 0, 0, 0, 0, 0]);
-}
-
 /// Whether a node has sent its boot-up message since then, and the time of it.
 fn boot_up(bench: &Bench, node: u8, since: Time) -> Option<Time> {
-    let id = 0x700 + u32::from(node);
-    let said = |frame: &&(Time, u32, Vec<u8>)| frame.1 == id && frame.2 == [0];
-    bench.frames_since(since).iter().find(said).map(|frame| frame.0)
+    let frames = bench.frames_of(0x700 + u32::from(node), since);
+    frames.into_iter().find(|(_, data)| *data == [0]).map(|(at, _)| at)
 }
 
 #[test]
@@ -64,7 +55,7 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
         (8, 10_000),
     ] {
         let mut bench = empty_board();
-        store(&mut bench, 3, BitRate::from_index(index).unwrap());
+        bench.store_by_lss(3, BitRate::from_index(index).unwrap());
         bench.power_cycle();
         bench.set_host_bit_rate(rate);
         let from = bench.time();
@@ -85,7 +76,7 @@ fn every_bit_rate_of_the_table_is_served_and_the_others_are_refused() {
 #[test]
 fn a_device_without_node_id_is_silent_until_it_gets_one() {
     let mut bench = empty_board();
-    store(&mut bench, 0xFF, BitRate::K125);
+    bench.store_by_lss(0xFF, BitRate::K125);
     bench.power_cycle();
     let from = bench.time();
     bench.run_ms(3000);
@@ -144,7 +135,7 @@ fn found_after(bench: &mut Bench, within_ms: u64) -> Option<Span> {
 fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
     for rate in [1_000_000, 250_000, 50_000] {
         let mut bench = empty_board();
-        store(&mut bench, NODE, BitRate::Auto);
+        bench.store_by_lss(NODE, BitRate::Auto);
         bench.power_cycle();
         bench.set_host_bit_rate(rate);
         // Another node of that bus acknowledges; the host sends every 20 ms.
@@ -168,7 +159,7 @@ fn finds_the_bit_rate_of_a_bus_with_traffic_and_disturbs_nobody() {
 fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
     for rate in [1_000_000, 250_000, 20_000] {
         let mut bench = empty_board();
-        store(&mut bench, NODE, BitRate::Auto);
+        bench.store_by_lss(NODE, BitRate::Auto);
         bench.power_cycle();
         bench.set_host_bit_rate(rate);
         let from = bench.time();
@@ -187,7 +178,7 @@ fn an_application_finds_the_bit_rate_too() {
     let mut bench = empty_board();
     bench.install(firmware::APP_V1);
     bench.call_back();
-    store(&mut bench, NODE, BitRate::Auto);
+    bench.store_by_lss(NODE, BitRate::Auto);
     bench.power_cycle();
     bench.set_host_bit_rate(500_000);
     bench.post(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]);
@@ -303,7 +294,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
 fn frames_lost_in_a_flood_are_told_once() {
     // It computes a CRC of 64 KiB in one step, without the chip's unit: frames are lost meanwhile.
     let mut bench = Bench::of_image(firmware::BOOTLOADER_CRC_16).switched_on();
-    store(&mut bench, NODE, BitRate::K1000);
+    bench.store_by_lss(NODE, BitRate::K1000);
     bench.power_cycle();
     bench.set_host_bit_rate(1_000_000);
     bench.run_ms(50);
@@ -340,7 +331,7 @@ fn frames_lost_in_a_flood_are_told_once() {
 fn a_value_that_comes_while_the_journal_is_erased_does_not_stop_the_core() {
     for ms in [30, 100, 200] {
         let mut bench = empty_board();
-        store(&mut bench, NODE, BitRate::K125);
+        bench.store_by_lss(NODE, BitRate::K125);
         // From 256 used places on it is compacted at once.
         bench.fill_journal(300);
         bench.power_cycle();

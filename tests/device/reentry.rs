@@ -141,13 +141,9 @@ fn the_answer_comes_before_the_departure_at_every_bit_rate() {
     call_back::at_every_bit_rate(firmware::APP_V1, |_, _| {});
 }
 
-/// Sets another node-ID and bit rate of a node by layer setting services (CiA 305), stores them, and restarts it.
-fn store_by_lss(bench: &mut Bench, node: u8, rate: BitRate) {
-    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
-    for [command, a, b] in [[0x11, node, 0], [0x13, 0, rate as u8], [0x17, 0, 0]] {
-        let answer = bench.ask(0x7E5, &[command, a, b, 0, 0, 0, 0, 0], 0x7E4);
-        assert_eq!(answer.as_deref(), Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]), "{command:02X}h");
-    }
+/// Restarts the node with another node-ID and bit rate.
+fn restart_as(bench: &mut Bench, node: u8, rate: BitRate) {
+    bench.store_by_lss(node, rate);
     bench.power_cycle();
     bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
 }
@@ -161,7 +157,7 @@ fn node_id_and_bit_rate_are_shared() {
         bench.install(firmware::APP_V1);
         let serial = bench.number(0x1018, 4);
 
-        store_by_lss(&mut bench, 9, BitRate::K250);
+        restart_as(&mut bench, 9, BitRate::K250);
         bench.await_program_of(9, 1000);
         if bootloader == firmware::BOOTLOADER_LEAST {
             // No program starts by itself.
@@ -178,7 +174,7 @@ fn node_id_and_bit_rate_are_shared() {
             continue;
         }
         // And from the bootloader: the program gets it from the handoff, and reports it by LSS.
-        store_by_lss(&mut bench, 21, BitRate::K500);
+        restart_as(&mut bench, 21, BitRate::K500);
         bench.await_boot_up_of(21, 1000);
         assert!(!bench.is_bootloader(21));
         bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);

@@ -149,7 +149,7 @@ fn goes_on(server: &Server, config: &Config, begun: impl FnOnce()) -> Action {
     assert_eq!(ended.updated, 1, "{said}");
     let action = server.action(IDS[0]);
     assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
-    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
+    assert!(action.feedback.iter().any(|(execution, _)| execution == "resumed"));
     action
 }
 
