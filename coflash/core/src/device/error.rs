@@ -101,7 +101,7 @@ pub enum Error {
         /// The device.
         node: NodeId,
         /// The property that differs.
-        what: Mismatch,
+        what: IdentityPart,
         /// The device's value.
         device: u32,
         /// The file's value.
@@ -431,12 +431,20 @@ pub enum IdentityPart {
 }
 
 impl IdentityPart {
-    /// The part at this position among the compared sub-indices.
-    pub(crate) const fn of(sub: usize) -> Self {
+    /// The part at this sub-index of 1018h.
+    pub(crate) const fn of(sub: u8) -> Self {
         match sub {
             1 => Self::VendorId,
             2 => Self::ProductCode,
             _ => Self::SerialNumber,
+        }
+    }
+
+    /// The error that the bootloader reports for a file with another value. A file names no serial number.
+    const fn error(self) -> FlashError {
+        match self {
+            Self::VendorId => FlashError::WrongVendorId,
+            Self::ProductCode | Self::SerialNumber => FlashError::WrongProductId,
         }
     }
 
@@ -445,32 +453,6 @@ impl IdentityPart {
             Self::VendorId => "vendor-ID",
             Self::ProductCode => "product code",
             Self::SerialNumber => "serial number",
-        }
-    }
-}
-
-/// The part of the identity in which file and device differ.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mismatch {
-    /// 1018h/1.
-    VendorId,
-    /// 1018h/2.
-    ProductCode,
-}
-
-impl Mismatch {
-    /// The error that the bootloader reports for it.
-    const fn error(self) -> FlashError {
-        match self {
-            Self::VendorId => FlashError::WrongVendorId,
-            Self::ProductCode => FlashError::WrongProductId,
-        }
-    }
-
-    const fn words(self) -> &'static str {
-        match self {
-            Self::VendorId => "vendor-ID",
-            Self::ProductCode => "product code",
         }
     }
 }

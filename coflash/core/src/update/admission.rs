@@ -12,7 +12,7 @@ use super::payload::{refusal_number, Payload};
 use super::steps::compare_target;
 use crate::advice::Advice;
 use crate::device::access::{security_of, takes_open, told_challenge, Challenge};
-use crate::device::error::{told, Error, Mismatch};
+use crate::device::error::{told, Error, IdentityPart};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Form, Session};
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
@@ -136,11 +136,17 @@ fn admit_manifest(session: &mut Session<'_>, file: &SealedFile, program: u8) -> 
     if head.program() != program {
         return Err(refused(&Refusal::Program { image: head.program(), device: program }));
     }
-    for (sub, image, what) in
-        [(1, head.vendor_id(), Mismatch::VendorId), (2, head.product_code(), Mismatch::ProductCode)]
-    {
-        // 0 is a normal value here: it only matches a device with the identity 0.
-        compare_identity(session, sub, image, what)?;
+    // 0 is a normal value here: it only matches a device with the identity 0.
+    for (sub, file) in [(1, head.vendor_id()), (2, head.product_code())] {
+        if let Some(device) = told(session.read_number(Address::new(IDENTITY, sub)))?.filter(|it| *it != file)
+        {
+            return Err(Error::WrongTarget {
+                node: session.node(),
+                what: IdentityPart::of(sub),
+                device,
+                file,
+            });
+        }
     }
     Ok(true)
 }
@@ -244,15 +250,6 @@ fn admit_place(
         image: (start, u32::try_from(last).unwrap_or(u32::MAX)),
         region: (first, region.last),
     })
-}
-
-fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {
-    match told(session.read_number(Address::new(IDENTITY, sub)))? {
-        Some(device) if device != file => {
-            Err(Error::WrongTarget { node: session.node(), what, device, file })
-        }
-        _ => Ok(()),
-    }
 }
 
 fn no_program(fault: Fault) -> Error {

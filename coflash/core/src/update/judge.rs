@@ -3,26 +3,24 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
-use super::event::RepeatReason;
-use crate::device::{Doing, Error};
+use super::event::{RepeatReason, Retry};
+use crate::device::{Doing, Error, Session, Transfers};
 
-/// The result of a download.
-pub(crate) enum Judgement {
-    /// The data arrived, and the device reports no error.
-    Good,
-    /// The data did not arrive, or the device reports an error.
-    Bad {
-        /// The reason for a repetition, if a repetition may help.
-        why: Option<RepeatReason>,
-        /// The error if it is not repeated.
-        error: Error,
-    },
+/// The error in 1F57h after a download, with its detail; `None` if it reports none.
+pub(crate) type DownloadStatus = Option<(FlashError, u16)>;
+
+/// A failed download: the data did not arrive, or the device reports an error.
+pub(crate) struct Failure {
+    /// The reason for a repetition, if a repetition may help.
+    pub(crate) why: Option<RepeatReason>,
+    /// The error if it is not repeated.
+    pub(crate) error: Error,
 }
 
-/// Judges a download by its result and by the device's status with its detail.
-pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, doing: Doing) -> Judgement {
+/// Judges a download by its result and by the device's status.
+pub(crate) fn judge(sent: Result<(), Error>, status: DownloadStatus, doing: Doing) -> Result<(), Failure> {
     let (why, error) = match (sent, status) {
-        (Ok(()), None) => return Judgement::Good,
+        (Ok(()), None) => return Ok(()),
         (sent, Some((error, detail))) => {
             let code = match sent {
                 Err(Error::Refused { code, .. }) => Some(code),
@@ -35,7 +33,33 @@ pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, 
         (Err(error @ Error::Refused { .. }), None) => (broken(&error), error),
         (Err(error), None) => (Some(RepeatReason::NoAnswer), error),
     };
-    Judgement::Bad { why, error }
+    Err(Failure { why, error })
+}
+
+/// The repetitions of a download.
+pub(crate) struct Repeats {
+    /// The block that is sent; `None` for the whole program.
+    pub(crate) block: Option<u32>,
+    /// The repetitions so far.
+    pub(crate) count: u32,
+    /// The permitted ones.
+    pub(crate) of: u32,
+}
+
+impl Repeats {
+    /// Counts one more repetition after this failure. From the second one on, the data go in segments: a
+    /// device or an adapter with problems in block transfer may work with them.
+    ///
+    /// # Errors
+    /// The error of the failure, if a repetition does not help, or is not permitted any more.
+    pub(crate) fn again(&mut self, session: &mut Session<'_>, failure: Failure) -> Result<Retry, Error> {
+        let Some(why) = failure.why.filter(|_| self.count < self.of) else { return Err(failure.error) };
+        self.count += 1;
+        if self.count > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
+            session.transfer_by(Transfers::Segments);
+        }
+        Ok(Retry { block: self.block, repeat: self.count, of: self.of, why })
+    }
 }
 
 /// The reason for a repetition, if the transfer broke off.

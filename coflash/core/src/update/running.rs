@@ -62,6 +62,10 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) wrote: bool,
     /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
+    /// The devices with which it gets its data together, as reported.
+    together: usize,
+    /// Whether it was reported that somebody else uses a COB-ID of the group.
+    disturbed: bool,
     tell: &'t mut dyn FnMut(Event),
     /// The events that were reported, if each event is reported only once.
     told: Option<Vec<Event>>,
@@ -82,6 +86,8 @@ impl<'t> RunningUpdate<'t> {
             postponed: false,
             wrote: false,
             mastership: None,
+            together: 0,
+            disturbed: false,
             tell,
             told: None,
         }
@@ -113,8 +119,12 @@ impl<'t> RunningUpdate<'t> {
 
     /// Reports an event.
     pub(super) fn tell(&mut self, event: Event) {
-        if let Event::Phase(Phase::Erased { took }) = &event {
-            self.postponed = *took < PUT_OFF && !self.wrote;
+        match &event {
+            Event::Phase(Phase::Erased { took }) => self.postponed = *took < PUT_OFF && !self.wrote,
+            Event::Note(Note::Together { devices }) if self.together == *devices => return,
+            Event::Note(Note::Together { devices }) => self.together = *devices,
+            Event::Warning(Warning::GroupDisturbed) if std::mem::replace(&mut self.disturbed, true) => return,
+            _ => {}
         }
         if let Some(told) = &mut self.told {
             if told.contains(&event) {

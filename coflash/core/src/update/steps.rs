@@ -8,7 +8,7 @@ use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
 use super::phase::{Note, PUT_OFF};
-use crate::device::error::{absent, told, Error, Mismatch};
+use crate::device::error::{absent, told, Error, IdentityPart};
 use crate::device::read_state::{autostart_words, program_start, state_after_failure};
 use crate::device::{DeviceType, Doing, Session, Timing};
 use crate::file::Target;
@@ -54,13 +54,12 @@ pub(super) fn compare_target(
         }
     }
     let node = session.node();
-    fits((vendor_id, product_code), device).map_err(|difference| match difference {
-        Difference::VendorId => {
-            Error::WrongTarget { node, what: Mismatch::VendorId, device: device.0, file: vendor_id }
-        }
-        Difference::ProductCode => {
-            Error::WrongTarget { node, what: Mismatch::ProductCode, device: device.1, file: product_code }
-        }
+    fits((vendor_id, product_code), device).map_err(|difference| {
+        let (what, device, file) = match difference {
+            Difference::VendorId => (IdentityPart::VendorId, device.0, vendor_id),
+            Difference::ProductCode => (IdentityPart::ProductCode, device.1, product_code),
+        };
+        Error::WrongTarget { node, what, device, file }
     })
 }
 
@@ -133,7 +132,7 @@ pub(super) fn running_program(session: &mut Session<'_>, number: u8) -> Result<O
 
 /// Waits for a restarting device, at most [`Timing::boot`], until `wanted` accepts its device type;
 /// returns the last device type.
-fn settle(
+pub(super) fn settle(
     session: &mut Session<'_>,
     wanted: impl Fn(DeviceType) -> bool,
 ) -> Result<Option<DeviceType>, Error> {
@@ -295,7 +294,7 @@ pub(super) fn identification(session: &mut Session<'_>, number: u8) -> Result<u3
 }
 
 /// The value of 1F56h before the erase, if the device reports it, for a comparison after a failure.
-pub(super) fn told_before(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
+pub(super) fn crc_before(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
     match identification(session, number) {
         Ok(crc) => Ok(Some(crc)),
         Err(error @ (Error::Adapter(_) | Error::Cancelled)) => Err(error),

@@ -51,7 +51,8 @@ fn failed(error: Error) -> Error {
 fn same_identity(session: &mut Session<'_>, bootloader: Identity) -> Result<(), Error> {
     let application = identity(session)?;
     for (sub, optional) in [(1, false), (2, true), (4, true)] {
-        let told = |identity: Identity| identity[sub - 1].filter(|number| !optional || *number != 0);
+        let told =
+            |identity: Identity| identity[usize::from(sub) - 1].filter(|number| !optional || *number != 0);
         let (expected, found) = (told(bootloader), told(application));
         let silent = found.is_none() && optional;
         if expected.is_some() && found != expected && !silent {

@@ -1,129 +1,84 @@
 //! The advice for an error.
 
-use canopen::program::FlashError;
-use canopen::program::{ACCESS, EVENTS};
-use canopen::AbortCode;
-
-use coboot_can::AdapterError;
+use canopen::debugger::DEBUGGER;
+use canopen::program::{FlashError, ACCESS, EVENTS};
+use canopen::{AbortCode, NodeId};
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
-use super::{absent, Error, LssFailure, TrialFailure, LOW_SUPPLY};
+use super::{absent, Ended, Error, LssFailure, TrialFailure, LOW_SUPPLY};
 use crate::advice::Advice;
 use crate::device::doing::{Doing, LssDoing};
 use crate::device::state::BootloaderState;
-
-/// An application that refuses with one of these does so in its present state (CiA 301 table 22).
-const DEVICE_STATE: AbortCode = AbortCode::DEVICE_STATE;
-const LOCAL_CONTROL: AbortCode = AbortCode::LOCAL_CONTROL;
 
 impl Error {
     /// What to do next.
     #[must_use]
     pub fn advice(&self) -> Advice {
-        match self {
-            Self::Adapter(error) => error.into(),
+        match *self {
+            Self::Adapter(ref error) => error.into(),
             Self::Cancelled => Advice::Continue,
-            Self::NoAnswer { node, .. } => Advice::Reach { node: *node },
+            Self::NoAnswer { node, .. } => Advice::Reach { node },
             Self::ShortAnswer { .. } => Advice::ShortAnswer,
-            Self::Refused { doing: Doing::Unlock, code, .. } => unlock_advice(*code),
-            Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
-                if at.index == canopen::debugger::DEBUGGER =>
-            {
-                debugger_advice(*code)
-            }
-            Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
-                if matches!(at.index, ACCESS | EVENTS) && absent(*code) =>
-            {
-                Advice::CallBootloader
-            }
-            Self::Refused { code, .. } => refusal_advice(*code),
+            Self::Refused { doing, code, .. } => refusal_advice(doing, code),
             Self::NotInDialect { .. } => Advice::OtherDialect,
             Self::NoPassword { .. } => Advice::GivePassword,
-            Self::Occupied { node } => Advice::Occupied { node: *node },
+            Self::Occupied { node } => Advice::Occupied { node },
             Self::NotAlone { .. } => Advice::NotAlone,
             Self::Protocol { .. } => Advice::InvalidAnswer,
-            Self::Failed { error: FlashError::Crc, doing: Doing::Block(0), .. } => Advice::OtherCrc,
-            Self::Failed { error: FlashError::Secured, detail: sector @ 1.., .. } => {
-                Advice::Unprotect { sector: *sector }
-            }
-            Self::Failed { error: FlashError::NotCleared, detail: program @ 1.., .. } => {
-                Advice::ClearFirst { program: *program }
-            }
-            Self::Failed { doing: Doing::Bootloader, error: FlashError::Format, .. } => {
-                Advice::OtherBootloader
-            }
-            Self::Failed { error: FlashError::NoAccess, detail: LOW_SUPPLY, .. } => Advice::Supply,
-            Self::Failed { error, .. } => failure_advice(*error),
+            Self::Failed { doing, error, detail, .. } => failure_advice(doing, error, detail),
             Self::NotRenewable { .. } => Advice::NotRenewable,
             Self::Unconfirmable { .. } => Advice::Unconfirmable,
-            Self::FirstFailed { first } => Advice::FirstFailed { first: *first },
+            Self::FirstFailed { first } => Advice::FirstFailed { first },
             Self::RenewalFailed { .. } => Advice::RenewalFailed,
             Self::SilentOnTrial { .. } => Advice::SilentOnTrial,
-            Self::WrongTarget { what, .. } => failure_advice(what.error()),
+            Self::WrongTarget { .. } => Advice::OtherProduct,
             Self::SealedOnly { .. } => Advice::Seal,
-            Self::NoProgram { advice, .. } => advice.clone(),
+            Self::NoProgram { ref advice, .. } => advice.clone(),
             Self::OtherRegion { .. } => Advice::OtherRegion,
             Self::OtherIdentity { .. } => Advice::OtherIdentity,
             Self::Busy { .. } => Advice::StaysBusy,
-            Self::NoBootloader { elsewhere: Some(other), .. } => {
-                Advice::BootloaderElsewhere { other: *other }
-            }
-            Self::NoBootloader { node, code: Some(DEVICE_STATE | LOCAL_CONTROL), .. }
-            | Self::TrialFailed { node, how: TrialFailure::Stays(Some(DEVICE_STATE | LOCAL_CONTROL)) } => {
-                Advice::RefusesNow { node: *node }
-            }
-            Self::NoBootloader { code: Some(code), .. } => call_advice(*code),
+            Self::NoBootloader { elsewhere: Some(other), .. } => Advice::BootloaderElsewhere { other },
+            Self::NoBootloader { node, code: Some(code), .. } => call_advice(node, code),
             Self::NoBootloader { .. } => Advice::Catch,
-            Self::Lss { doing, failure: LssFailure::NoAnswer } => match doing {
-                LssDoing::Fastscan => Advice::FastscanAgain,
-                LssDoing::Select => Advice::LssAddress,
-                _ => Advice::LssSilence,
-            },
-            Self::Lss { failure: LssFailure::None, .. } => Advice::AssignNode,
-            Self::Lss { doing, failure: LssFailure::Refused { code, .. } } => match (doing, code) {
-                (LssDoing::Store, 1) => Advice::NoStorage,
-                (LssDoing::Store, _) => Advice::BrokenStorage,
-                (LssDoing::BitRate, _) => Advice::OtherBitRate,
-                _ => Advice::OtherNodeId,
-            },
+            Self::Lss { doing, failure } => lss_advice(doing, failure),
             Self::WrongCrc { .. } => Advice::WrongCrc,
-            Self::TrialFailed { how: TrialFailure::NotStarted(_, state), .. } => not_started_advice(*state),
-            Self::TrialFailed {
-                how:
-                    TrialFailure::Silent(Some(other))
-                    | TrialFailure::FellSilent(Some(other))
-                    | TrialFailure::Lost(Some(other)),
-                ..
-            } => Advice::TrialElsewhere { other: *other },
-            Self::TrialFailed {
-                node,
-                how: TrialFailure::Silent(None) | TrialFailure::FellSilent(None) | TrialFailure::Lost(None),
-            } => Advice::TrialSilent { node: *node },
-            Self::TrialFailed { node, how: TrialFailure::Stays(_) } => Advice::GiveWayBack { node: *node },
-            Self::ProgramEnded { ended, .. } | Self::TrialFailed { how: TrialFailure::Ended(ended), .. } => {
-                ended_advice(ended.by)
-            }
+            Self::TrialFailed { node, how } => trial_advice(node, how),
+            Self::ProgramEnded { ended, .. } => ended_advice(ended.by),
             Self::StartFailed { running: Some(running), state, .. } if running.is_bootloader() => {
-                not_started_advice(*state)
+                not_started_advice(state)
             }
             Self::StartFailed { elsewhere: Some(other), .. }
-            | Self::FellSilent { elsewhere: Some(other), .. } => Advice::ProgramElsewhere { other: *other },
-            Self::StartFailed { node, .. } | Self::FellSilent { node, .. } => {
-                Advice::ProgramSilent { node: *node }
-            }
+            | Self::FellSilent { elsewhere: Some(other), .. } => Advice::ProgramElsewhere { other },
+            Self::StartFailed { node, .. } | Self::FellSilent { node, .. } => Advice::ProgramSilent { node },
         }
     }
 }
 
-impl From<&AdapterError> for Advice {
-    fn from(error: &AdapterError) -> Self {
-        let words = error.advice();
-        match error {
-            AdapterError::Url { .. } => Self::Url { words },
-            error if error.is_absent() => Self::NoAdapter { words },
-            _ => Self::Adapter { words },
+fn trial_advice(node: NodeId, how: TrialFailure) -> Advice {
+    match how {
+        TrialFailure::NotStarted(_, state) => not_started_advice(state),
+        TrialFailure::Silent(elsewhere)
+        | TrialFailure::FellSilent(elsewhere)
+        | TrialFailure::Lost(elsewhere) => {
+            elsewhere.map_or(Advice::TrialSilent { node }, |other| Advice::TrialElsewhere { other })
         }
+        TrialFailure::Stays(Some(code)) if is_of_state(code) => Advice::RefusesNow { node },
+        TrialFailure::Stays(_) => Advice::GiveWayBack { node },
+        TrialFailure::Ended(Ended { by, .. }) => ended_advice(by),
+    }
+}
+
+fn lss_advice(doing: LssDoing, failure: LssFailure) -> Advice {
+    match (failure, doing) {
+        (LssFailure::NoAnswer, LssDoing::Fastscan) => Advice::FastscanAgain,
+        (LssFailure::NoAnswer, LssDoing::Select) => Advice::LssAddress,
+        (LssFailure::NoAnswer, _) => Advice::LssSilence,
+        (LssFailure::None, _) => Advice::AssignNode,
+        (LssFailure::Refused { code: 1, .. }, LssDoing::Store) => Advice::NoStorage,
+        (LssFailure::Refused { .. }, LssDoing::Store) => Advice::BrokenStorage,
+        (LssFailure::Refused { .. }, LssDoing::BitRate) => Advice::OtherBitRate,
+        (LssFailure::Refused { .. }, _) => Advice::OtherNodeId,
     }
 }
 
@@ -152,64 +107,74 @@ const fn ended_advice(by: Option<ResetCause>) -> Advice {
     }
 }
 
-const fn failure_advice(error: FlashError) -> Advice {
-    match error {
-        FlashError::NoValidProgram => Advice::NoValidProgram,
-        FlashError::Format => Advice::WrongFormat,
-        FlashError::Crc => Advice::CheckBus,
-        FlashError::NotCleared => Advice::NotCleared,
-        FlashError::Write => Advice::WriteFailed,
-        FlashError::Address => Advice::OtherMap,
-        FlashError::Secured => Advice::Secured,
-        FlashError::NvData => Advice::NvData,
-        FlashError::WrongVendorId | FlashError::WrongProductId => Advice::OtherProduct,
-        FlashError::NoAccess => Advice::NoAccess,
-        FlashError::Busy => Advice::WaitABit,
-        FlashError::Signature => Advice::BadSignature,
-        FlashError::Rollback => Advice::Rollback,
-        FlashError::Key => Advice::OtherKey,
-        FlashError::Sequence => Advice::Sequence,
+fn failure_advice(doing: Doing, error: FlashError, detail: u16) -> Advice {
+    match (error, detail) {
+        (FlashError::Crc, _) if doing == Doing::Block(0) => Advice::OtherCrc,
+        (FlashError::Format, _) if doing == Doing::Bootloader => Advice::OtherBootloader,
+        (FlashError::Secured, sector @ 1..) => Advice::Unprotect { sector },
+        (FlashError::NotCleared, program @ 1..) => Advice::ClearFirst { program },
+        (FlashError::NoAccess, LOW_SUPPLY) => Advice::Supply,
+        (FlashError::NoValidProgram, _) => Advice::NoValidProgram,
+        (FlashError::Format, _) => Advice::WrongFormat,
+        (FlashError::Crc, _) => Advice::CheckBus,
+        (FlashError::NotCleared, _) => Advice::NotCleared,
+        (FlashError::Write, _) => Advice::WriteFailed,
+        (FlashError::Address, _) => Advice::OtherMap,
+        (FlashError::Secured, _) => Advice::Secured,
+        (FlashError::NvData, _) => Advice::NvData,
+        (FlashError::WrongVendorId | FlashError::WrongProductId, _) => Advice::OtherProduct,
+        (FlashError::NoAccess, _) => Advice::NoAccess,
+        (FlashError::Busy, _) => Advice::WaitABit,
+        (FlashError::Signature, _) => Advice::BadSignature,
+        (FlashError::Rollback, _) => Advice::Rollback,
+        (FlashError::Key, _) => Advice::OtherKey,
+        (FlashError::Sequence, _) => Advice::Sequence,
         _ => Advice::OnceMore,
     }
 }
 
-/// The advice for an application that refuses the call to the bootloader, whatever its state.
-fn call_advice(code: AbortCode) -> Advice {
+/// Whether an application that refuses with this code does so in its present state (CiA 301 table 22).
+fn is_of_state(code: AbortCode) -> bool {
+    matches!(code, AbortCode::DEVICE_STATE | AbortCode::LOCAL_CONTROL)
+}
+
+/// The advice for an application that refuses the call to the bootloader.
+fn call_advice(node: NodeId, code: AbortCode) -> Advice {
     match code {
+        code if is_of_state(code) => Advice::RefusesNow { node },
         AbortCode::INVALID_VALUE => Advice::UnknownCall,
         AbortCode::NO_OBJECT
         | AbortCode::NO_SUB_INDEX
         | AbortCode::READ_ONLY
         | AbortCode::UNSUPPORTED_ACCESS => Advice::NoCallBack,
-        code => refusal_advice(code),
+        code => any_refusal_advice(code),
     }
 }
 
-fn unlock_advice(code: AbortCode) -> Advice {
-    match code {
-        AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX => Advice::NeedsNoPassword,
-        AbortCode::DEVICE_STATE => Advice::PasswordLater,
-        _ => Advice::WrongPassword,
+fn refusal_advice(doing: Doing, code: AbortCode) -> Advice {
+    let index = match doing {
+        Doing::Read(at) | Doing::Write(at) => Some(at.index),
+        _ => None,
+    };
+    match (doing, code) {
+        (Doing::Unlock, AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX) => Advice::NeedsNoPassword,
+        (Doing::Unlock, AbortCode::DEVICE_STATE) => Advice::PasswordLater,
+        (Doing::Unlock, _) => Advice::WrongPassword,
+        (_, AbortCode::NO_OBJECT) if index == Some(DEBUGGER) => Advice::NoDebugger,
+        (_, AbortCode::INVALID_VALUE) if index == Some(DEBUGGER) => Advice::NoAccessToBytes,
+        (_, AbortCode::DEVICE_STATE) if index == Some(DEBUGGER) => Advice::ReadOutProtected,
+        (_, AbortCode::LOCAL_CONTROL) if index == Some(DEBUGGER) => Advice::FlashBusy,
+        (_, code) if matches!(index, Some(ACCESS | EVENTS)) && absent(code) => Advice::CallBootloader,
+        (_, code) => any_refusal_advice(code),
     }
 }
 
-fn refusal_advice(code: AbortCode) -> Advice {
+fn any_refusal_advice(code: AbortCode) -> Advice {
     match code {
         AbortCode::NO_OBJECT => Advice::NoObject,
         AbortCode::NO_SUB_INDEX => Advice::NoProgramNumber,
         AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY => Advice::SmallerBlocks,
         AbortCode::TIMEOUT | AbortCode::TOGGLE | AbortCode::COMMAND => Advice::LostFrames,
         _ => Advice::Refused,
-    }
-}
-
-/// The advice for a refusal of the debugger interface, 1025h.
-fn debugger_advice(code: AbortCode) -> Advice {
-    match code {
-        AbortCode::NO_OBJECT => Advice::NoDebugger,
-        AbortCode::INVALID_VALUE => Advice::NoAccessToBytes,
-        AbortCode::DEVICE_STATE => Advice::ReadOutProtected,
-        AbortCode::LOCAL_CONTROL => Advice::FlashBusy,
-        code => refusal_advice(code),
     }
 }

@@ -7,23 +7,22 @@ use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address};
 use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
-use super::cia302;
-use super::procedure::{enter_by_call, Downloaded, Procedure};
+use super::procedure::{Downloaded, Procedure};
+use super::whole;
 use crate::advice::Advice;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
-use crate::device::{Dialect, Doing, Error, Session, Timing, Transfers};
+use crate::device::{Dialect, Doing, Error, Session, Timing};
 use crate::file::block_file::{Block as FileBlock, BlockFile, FRAMING};
 use crate::file::checksum::Checksum;
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
 use crate::file::sealed::SealedFile;
 use crate::update::device_after::DeviceState;
-use crate::update::event::{Event, Note, Phase, RepeatReason, Retry, Warning};
-use crate::update::judge::{judge, Judgement};
+use crate::update::event::{Event, Note, Phase, RepeatReason, Warning};
+use crate::update::judge::{judge, Repeats};
 use crate::update::options::FlashOptions;
 use crate::update::payload::Payload;
-use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::{steps, trial};
 use coboot_can::adapter::Delivery;
@@ -38,15 +37,6 @@ const NOT_TOGETHER: Error = Error::NotInDialect {
 };
 
 impl Procedure for Block {
-    fn enter(
-        &self,
-        session: &mut Session<'_>,
-        found: Found,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<Dialect, Error> {
-        enter_by_call(session, found, update)
-    }
-
     /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
     /// With `start` off, the program is neither tried nor released. A sealed image is sent in one
     /// download, unless the user asked for blocks or the device gets it together with others; and it
@@ -65,11 +55,11 @@ impl Procedure for Block {
         }
         let (file, is_sealed) = match file {
             Payload::Program(program) => (BlockFile::of(program), false),
-            Payload::Bootloader(image) => return cia302::download(session, image.bytes(), crcs, update),
+            Payload::Bootloader(_) => return whole::download(self, session, file, update),
             Payload::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
-                    None => return cia302::download(session, sealed.bytes(), crcs, update),
+                    None => return whole::download(self, session, file, update),
                     Some(size) => size,
                 };
                 (cut_up(session, sealed, size, number)?, true)
@@ -225,7 +215,7 @@ fn send(
     update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
     let number = update.options.program;
-    let before = steps::told_before(session, number)?;
+    let before = steps::crc_before(session, number)?;
     update.erases(before);
     if let Some(partial) = partial {
         let total = file.own.size() as usize;
@@ -255,17 +245,13 @@ fn send_blocks(
     in_group: &mut bool,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
-    let options = update.options;
     let begun = partial.and_then(|partial| partial.checksum_of(file.own));
     let mut checksum = begun.unwrap_or(file.own.checksum());
     let size = |blocks: &VecDeque<FileBlock<'_>>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
     let mut blocks: VecDeque<FileBlock<'_>> = file.file().blocks().iter().cloned().collect();
     let mut total = size(&blocks);
     let mut may_split = file.joined.is_some() && !*in_group;
-    let mut done = 0;
-    let mut repeats = 0;
-    let mut in_vain = 0;
-    let (mut together, mut disturbed) = (0, false);
+    let (mut done, mut repeats, mut in_vain) = (0, 0, 0);
     update.tell(Event::Progress { done, total });
     while let Some(block) = blocks.pop_front() {
         let bytes = file.own.emit_block(&block, checksum);
@@ -284,21 +270,10 @@ fn send_blocks(
             other_crc: is_control.then(|| file.own.emit_block(&block, checksum.other())),
             in_group: *in_group && !is_control,
             may_split: may_split && file.has_joined(&block),
+            place: (done, total),
         };
         let form = session.transfers();
-        let sent = send_block(session, one, &options, &mut |event| match event {
-            Event::Progress { done: part, .. } => update.tell(Event::Progress { done: done + part, total }),
-            Event::Note(Note::Together { devices }) if devices == together => {}
-            Event::Warning(Warning::GroupDisturbed) if disturbed => {}
-            event => {
-                match event {
-                    Event::Note(Note::Together { devices }) => together = devices,
-                    Event::Warning(Warning::GroupDisturbed) => disturbed = true,
-                    _ => {}
-                }
-                update.tell(event);
-            }
-        });
+        let sent = send_block(session, one, update);
         // A device that postpones the erase starts it with the first good data: block 0 alone loses
         // nothing.
         let is_refused = sent.as_ref().is_err_and(Error::refuses_first_blocks);
@@ -354,10 +329,11 @@ struct One<'b> {
     in_group: bool,
     /// It has joined several blocks of the file, which can go one by one.
     may_split: bool,
+    /// The bytes before it, and those of all blocks.
+    place: (usize, usize),
 }
 
 /// The end of a block that the device has not refused for good.
-#[derive(Default)]
 struct Sent {
     repeats: u32,
     /// The device has taken block 0 with the other CRC.
@@ -369,69 +345,59 @@ struct Sent {
 /// Steps 7 and 8 for one block, with repetition.
 fn send_block(
     session: &mut Session<'_>,
-    One { number: block, mut bytes, ref other_crc, in_group, may_split }: One<'_>,
-    options: &FlashOptions,
-    tell: &mut dyn FnMut(Event),
+    One { number: block, mut bytes, ref other_crc, in_group, may_split, place: (done, total) }: One<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Sent, Error> {
-    let doing = Doing::Block(block);
-    let at = Address::new(program::PROGRAM_DATA, options.program);
-    let mut repeat = 0;
+    let FlashOptions { program: number, repeats: of, .. } = update.options;
+    let (doing, at) = (Doing::Block(block), Address::new(program::PROGRAM_DATA, number));
+    let mut repeats = Repeats { block: Some(block), count: 0, of };
     // Whether the result of an earlier transfer is unknown: its block may have arrived.
     let mut in_doubt = false;
     let (own, mut by_other_crc) = (bytes, false);
     loop {
-        let met = if in_group { session.write_together(block, at, bytes)? } else { Delivery::Alone };
-        let sent = match met {
+        let delivery = if in_group { session.write_together(block, at, bytes)? } else { Delivery::Alone };
+        let end = Sent { repeats: repeats.count, by_other_crc, split: false };
+        let sent = match delivery {
             Delivery::Taken(devices) => {
-                tell(Note::Together { devices }.into());
+                update.tell(Note::Together { devices }.into());
                 // A block that the device cannot write is reported with the next one.
-                return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
+                return Ok(end);
             }
             Delivery::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
             Delivery::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
             Delivery::Alone | Delivery::Disturbed => {
-                if met == Delivery::Disturbed {
-                    tell(Warning::GroupDisturbed.into());
+                if delivery == Delivery::Disturbed {
+                    update.tell(Warning::GroupDisturbed.into());
                 }
                 let mut progress =
-                    |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
+                    |part: u32| update.tell(Event::Progress { done: done + part as usize, total });
                 session.write(at, bytes, doing, &mut progress)
             }
         };
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }
-        let status = session.await_idle(options.program, doing)?;
+        let status = session.await_idle(number, doing)?;
         // The earlier block had arrived, and the bootloader waits for the next one. If this is
         // wrong, the next block, or at the latest the program's CRC, shows it.
         if in_doubt && status.error == Some(FlashError::Sequence) {
-            return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
+            return Ok(end);
         }
-        let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
-            Judgement::Good => return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() }),
-            Judgement::Bad { why, error } => (why, error),
-        };
-        if may_split && !in_doubt && is_too_long(&error) {
-            return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
+        let judged = judge(sent, status.error.map(|error| (error, status.detail)), doing);
+        let Err(failure) = judged else { return Ok(end) };
+        if may_split && !in_doubt && is_too_long(&failure.error) {
+            return Ok(Sent { split: true, ..end });
         }
+        let why = failure.why;
         in_doubt |= why == Some(RepeatReason::NoAnswer);
-        match why {
-            Some(why) if repeat < options.repeats => {
-                repeat += 1;
-                // A device or an adapter with problems in block transfer may work with segments.
-                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
-                    session.transfer_by(Transfers::Segments);
-                }
-                if let (RepeatReason::Crc, Some(other)) = (why, other_crc) {
-                    by_other_crc = !by_other_crc;
-                    bytes = if by_other_crc { other } else { own };
-                }
-                tell(Event::Retry(Retry::block(block, repeat, options.repeats, why)));
-                if repeat > 1 && may_split && !in_doubt {
-                    return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
-                }
-            }
-            _ => return Err(error),
+        let retry = repeats.again(session, failure)?;
+        if let (Some(RepeatReason::Crc), Some(other)) = (why, other_crc) {
+            by_other_crc = !by_other_crc;
+            bytes = if by_other_crc { other } else { own };
+        }
+        update.tell(Event::Retry(retry));
+        if repeats.count > 1 && may_split && !in_doubt {
+            return Ok(Sent { repeats: repeats.count, split: true, ..end });
         }
     }
 }

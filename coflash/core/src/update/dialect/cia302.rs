@@ -4,16 +4,14 @@
 use canopen::program::{self, ProgramControl, ProgramState};
 use canopen::Address;
 
-use super::procedure::{Downloaded, Procedure};
-use super::whole::{self, Whole};
+use super::procedure::Procedure;
 use crate::device::error::absent;
-use crate::device::{Dialect, Doing, Error, Session};
+use crate::device::{Dialect, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
-use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
-use crate::update::steps::{call_back, clear_and_wait, running_program};
+use crate::update::steps::{call_back, running_program};
 
 /// See the [module](self).
 pub(super) struct Cia302(pub(super) Dialect);
@@ -32,30 +30,6 @@ impl Procedure for Cia302 {
         update.tell(Note::Dialect { dialect: self.0 }.into());
         Ok(self.0)
     }
-
-    fn download(
-        &self,
-        session: &mut Session<'_>,
-        file: &Payload,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<Downloaded, Error> {
-        download(session, &file.encoded(self.0.form()), file.crcs(), update)
-    }
-}
-
-/// Erases, and sends this content.
-pub(super) fn download(
-    session: &mut Session<'_>,
-    content: &[u8],
-    crcs: [u32; 2],
-    update: &mut RunningUpdate<'_>,
-) -> Result<Downloaded, Error> {
-    let number = update.options.program;
-    let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
-        clear_and_wait(session, number, &mut |event| update.tell(event))
-    };
-    let whole = Whole { number, content, doing: Doing::Program, prepare: &prepare, status: whole::status };
-    whole::download(session, &whole, crcs, update)
 }
 
 /// Calls the bootloader of a device that only supports CiA 302-3 with STOP: the bootloader then

@@ -5,15 +5,14 @@ use std::time::Duration;
 use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
-use super::procedure::{enter_by_call, Downloaded, Procedure};
+use super::procedure::Procedure;
 use super::restart::{arrived, reset_program};
-use super::whole::{self, idle, Said, Whole};
+use super::whole::idle;
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::event::Note;
+use crate::update::judge::DownloadStatus;
 use crate::update::password::Password;
-use crate::update::payload::Payload;
-use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::await_application;
 
@@ -28,35 +27,37 @@ const ERROR_BITS: u32 = 0x81;
 pub(super) struct EsAcademy;
 
 impl Procedure for EsAcademy {
-    fn enter(
+    /// The password of a program erases it.
+    fn prepare(
         &self,
         session: &mut Session<'_>,
-        found: Found,
+        number: u8,
         update: &mut RunningUpdate<'_>,
-    ) -> Result<Dialect, Error> {
-        enter_by_call(session, found, update)
+    ) -> Result<(), Error> {
+        if self.unlock(session, update.options.unlock, number)? {
+            update.tell(Note::Unlocked.into());
+        }
+        Ok(())
     }
 
-    fn download(
-        &self,
-        session: &mut Session<'_>,
-        file: &Payload,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<Downloaded, Error> {
-        let (number, doing, password) = (update.options.program, Doing::Program, update.options.unlock);
-        let content = file.encoded(Dialect::EsAcademy.form());
-        let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
-            if self.unlock(session, password, number)? {
-                update.tell(Note::Unlocked.into());
-            }
-            Ok(())
+    /// From 1F57h if the device has it, otherwise from 1001h.
+    fn status(&self, session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
+        match session.read(Address::new(program::FLASH_STATUS, number)) {
+            Err(Error::Refused { code, .. }) if absent(code) => {}
+            // A device that has the whole program may restart at once.
+            Err(Error::NoAnswer { .. }) => return Ok(None),
+            Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number, doing),
+            Err(error) => return Err(error),
+        }
+        let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {
+            Err(Error::NoAnswer { .. }) => None,
+            register => optional(register)?,
         };
-        let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-        whole::download(session, &whole, file.crcs(), update)
+        let failed = register.is_some_and(|bits| bits & ERROR_BITS == ERROR_BITS);
+        Ok(failed.then_some((FlashError::Unspecified, 0)))
     }
 
-    /// The password is optional; without it, the download alone must be sufficient. That of a program
-    /// erases it.
+    /// The password is optional; without it, the download alone must be sufficient.
     fn unlock(
         &self,
         session: &mut Session<'_>,
@@ -89,21 +90,4 @@ impl Procedure for EsAcademy {
         reset_program(session, number)?;
         arrived(session, number)
     }
-}
-
-/// The result of the download, from 1F57h if the device has it, otherwise from 1001h.
-fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
-    match session.read(Address::new(program::FLASH_STATUS, number)) {
-        Err(Error::Refused { code, .. }) if absent(code) => {}
-        // A device that has the whole program may restart at once.
-        Err(Error::NoAnswer { .. }) => return Ok(None),
-        Ok(_) | Err(Error::Protocol { .. }) => return idle(session, number, doing),
-        Err(error) => return Err(error),
-    }
-    let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {
-        Err(Error::NoAnswer { .. }) => None,
-        register => optional(register)?,
-    };
-    let failed = register.is_some_and(|bits| bits & ERROR_BITS == ERROR_BITS);
-    Ok(failed.then_some((FlashError::Unspecified, 0)))
 }

@@ -6,9 +6,8 @@ use canopen::nmt::parse_state_message;
 use canopen::program::LIFT_NODE_ID;
 use canopen::{AbortCode, Address, NodeId};
 
-use super::procedure::{Downloaded, Procedure};
+use super::procedure::Procedure;
 use super::restart::{arrived, reset_program};
-use super::whole::{self, Whole};
 use crate::device::flying_master::{self, Asked};
 use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
@@ -17,9 +16,9 @@ use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, Warning};
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
-use crate::update::payload::Payload;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
+use crate::update::steps::settle;
 
 /// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
 /// (CiA 814-1 clause 6.4).
@@ -64,18 +63,9 @@ impl Procedure for Lift {
         Ok(Dialect::Lift)
     }
 
-    fn download(
-        &self,
-        session: &mut Session<'_>,
-        file: &Payload,
-        update: &mut RunningUpdate<'_>,
-    ) -> Result<Downloaded, Error> {
-        let content = file.encoded(Dialect::Lift.form());
-        // The device is already unlocked; the download overwrites the old program.
-        let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
-        let (number, doing, status) = (update.options.program, Doing::Program, whole::status);
-        let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-        whole::download(session, &whole, file.crcs(), update)
+    /// The device is already unlocked; the download overwrites the old program.
+    fn prepare(&self, _: &mut Session<'_>, _: u8, _: &mut RunningUpdate<'_>) -> Result<(), Error> {
+        Ok(())
     }
 
     fn unlock(&self, session: &mut Session<'_>, password: Option<Password>, _: u8) -> Result<bool, Error> {
@@ -125,7 +115,11 @@ fn unlock_bootloader(
             restarted => restarted?,
         }
         session.talk_to(lift);
-        await_lift(session)?;
+        let timing = Timing { boot: LIFT_WAIT.max(session.timing().boot), ..brief(session.timing()) };
+        let running = settle(&mut session.with(lift, timing), DeviceType::is_bootloader)?;
+        if !running.is_some_and(DeviceType::is_bootloader) {
+            return Err(Error::NoBootloader { node: lift, running, code: None, elsewhere: None });
+        }
         update.tell(Note::Moved { node: lift }.into());
         update.tell(Phase::InBootloader.into());
     }
@@ -171,24 +165,6 @@ fn lift_node() -> NodeId {
 /// Time limits for a single, short request.
 fn brief(timing: &Timing) -> Timing {
     Timing { sdo: LIFT_PAUSE.min(timing.sdo), attempts: 1, ..*timing }
-}
-
-/// Waits until a lift bootloader answers.
-fn await_lift(session: &mut Session<'_>) -> Result<(), Error> {
-    let deadline = session.now() + LIFT_WAIT.max(session.timing().boot);
-    let timing = brief(session.timing());
-    loop {
-        // A boot-up message ends the pause; it may get lost.
-        session.await_boot_up(LIFT_PAUSE)?;
-        let node = session.node();
-        let running = session.with(node, timing).device_type()?;
-        if running.is_some_and(DeviceType::is_bootloader) {
-            return Ok(());
-        }
-        if session.now() >= deadline {
-            return Err(Error::NoBootloader { node: session.node(), running, code: None, elsewhere: None });
-        }
-    }
 }
 
 /// Writes the password of a lift.

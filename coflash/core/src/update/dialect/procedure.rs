@@ -4,9 +4,11 @@ use std::time::Duration;
 
 use canopen::NodeId;
 
-use crate::device::{DeviceType, Dialect, Error, Session};
+use super::whole;
+use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
+use crate::update::judge::DownloadStatus;
 use crate::update::password::Password;
 use crate::update::payload::Payload;
 use crate::update::reach::Found;
@@ -16,8 +18,8 @@ use crate::update::steps;
 
 /// The parts of an update that each dialect and the renewal of a bootloader implement, in their order.
 pub(in crate::update) trait Procedure {
-    /// Step 3: makes the bootloader run. Returns the dialect of the bootloader, which may report
-    /// more than the application did.
+    /// Step 3: makes the bootloader run, by the call of coboot and SYS TEC. Returns the dialect of the
+    /// bootloader, which may report more than the application did.
     ///
     /// # Errors
     /// [`Error::NoBootloader`], [`Error::NotInDialect`], and the errors of unlocking.
@@ -26,10 +28,14 @@ pub(in crate::update) trait Procedure {
         session: &mut Session<'_>,
         found: Found,
         update: &mut RunningUpdate<'_>,
-    ) -> Result<Dialect, Error>;
+    ) -> Result<Dialect, Error> {
+        let dialect = call_back(session, found, update)?;
+        update.tell(Note::Dialect { dialect }.into());
+        Ok(dialect)
+    }
 
-    /// Steps 4 to 14: afterwards the program is in the device and starts at the next reset, or its bootloader
-    /// is renewed.
+    /// Steps 4 to 14, in one download of the program: afterwards it is in the device and starts at the next
+    /// reset, or its bootloader is renewed.
     ///
     /// # Errors
     /// The device's refusal.
@@ -38,7 +44,30 @@ pub(in crate::update) trait Procedure {
         session: &mut Session<'_>,
         file: &Payload,
         update: &mut RunningUpdate<'_>,
-    ) -> Result<Downloaded, Error>;
+    ) -> Result<Downloaded, Error> {
+        whole::download(self, session, file, update)
+    }
+
+    /// Steps 4 and 5, before each attempt of one download: erases the program.
+    ///
+    /// # Errors
+    /// The device's refusal.
+    fn prepare(
+        &self,
+        session: &mut Session<'_>,
+        number: u8,
+        update: &mut RunningUpdate<'_>,
+    ) -> Result<(), Error> {
+        steps::clear_and_wait(session, number, &mut |event| update.tell(event))
+    }
+
+    /// Reads the device's result of one download.
+    ///
+    /// # Errors
+    /// The errors of a [read](Session::read).
+    fn status(&self, session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
+        whole::status(session, number, doing)
+    }
 
     /// Writes the password for the bootloader's own program number, in a dialect with passwords; whether
     /// there was one to write. A locked device needs it again after each reset.
@@ -76,17 +105,6 @@ pub(in crate::update) struct Downloaded {
     pub(in crate::update) released: Option<bool>,
     /// The results of a renewal, after which the program runs again if it did before.
     pub(in crate::update) renewal: Option<Renewal>,
-}
-
-/// [`call_back`], with a note of the dialect.
-pub(super) fn enter_by_call(
-    session: &mut Session<'_>,
-    found: Found,
-    update: &mut RunningUpdate<'_>,
-) -> Result<Dialect, Error> {
-    let dialect = call_back(session, found, update)?;
-    update.tell(Note::Dialect { dialect }.into());
-    Ok(dialect)
 }
 
 /// Calls an application back with the call of coboot and SYS TEC. Returns the bootloader's dialect:

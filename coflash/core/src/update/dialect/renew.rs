@@ -8,13 +8,14 @@ use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 use super::each::of;
 use super::procedure::{call_back, Downloaded, Procedure};
-use super::whole::{self, Whole};
+use super::whole;
 use crate::device::access::takes_open;
 use crate::device::error::told;
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::{Dialect, Doing, Error, Form, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::Phase;
+use crate::update::judge::DownloadStatus;
 use crate::update::options::FlashOptions;
 use crate::update::payload::Payload;
 use crate::update::reach::{find, Found};
@@ -77,6 +78,14 @@ impl Procedure for Renew {
         let Renewal { repeats, transfer: took, .. } = renewal;
         Ok(Downloaded { repeats, took, released: None, renewal: Some(Renewal { running, ..renewal }) })
     }
+
+    fn prepare(&self, session: &mut Session<'_>, number: u8, _: &mut RunningUpdate<'_>) -> Result<(), Error> {
+        execute(session, number, ProgramControl::Clear)
+    }
+
+    fn status(&self, session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
+        whole::idle(session, number, doing)
+    }
 }
 
 fn renew(
@@ -103,7 +112,8 @@ fn renew(
     if !(is_same && is_open) {
         leave_trial(session, number, running, update)?;
         let began = session.now();
-        repeats = stage(session, number, file, update)?;
+        let content = file.encoded(Form::Image);
+        repeats = whole::send(&Renew, session, number, &content, Doing::Bootloader, update)?;
         transfer = session.now().saturating_sub(began);
         if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
             // The device has found the same image.
@@ -200,22 +210,6 @@ fn restart(session: &mut Session<'_>, number: u8, update: &mut RunningUpdate<'_>
     (update.called, update.options) = (called, options);
     entered?;
     unlock(session, number, update)
-}
-
-/// Downloads the image into staging; returns the number of repetitions.
-fn stage(
-    session: &mut Session<'_>,
-    number: u8,
-    file: &Payload,
-    update: &mut RunningUpdate<'_>,
-) -> Result<u32, Error> {
-    let content = file.encoded(Form::Image);
-    let prepare = |session: &mut Session<'_>, _: &mut RunningUpdate<'_>| {
-        execute(session, number, ProgramControl::Clear)
-    };
-    let (doing, status) = (Doing::Bootloader, whole::idle);
-    let whole = Whole { number, content: &content, doing, prepare: &prepare, status };
-    whole::send(session, &whole, update)
 }
 
 /// Whether the device runs this image. A sealed image is judged by the device.

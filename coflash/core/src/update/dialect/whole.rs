@@ -2,15 +2,16 @@
 
 use std::time::Duration;
 
-use canopen::program::{self, FlashError};
+use canopen::program;
 use canopen::Address;
 
-use super::procedure::Downloaded;
+use super::procedure::{Downloaded, Procedure};
 use crate::device::error::absent;
-use crate::device::{Doing, Error, Session, Timing, Transfers};
+use crate::device::{Doing, Error, Session, Timing};
 use crate::update::device_after::DeviceState;
-use crate::update::event::{Event, RepeatReason, Retry};
-use crate::update::judge::{judge, Judgement};
+use crate::update::event::Event;
+use crate::update::judge::{judge, DownloadStatus, Repeats};
+use crate::update::payload::Payload;
 use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
@@ -18,62 +19,50 @@ use crate::update::steps;
 /// plus a margin.
 const SLOW_SEGMENT: Duration = Duration::from_secs(5);
 
-/// The result in 1F57h: an error and its detail.
-pub(super) type Said = Option<(FlashError, u16)>;
-
-/// The data to send, and the dialect's actions around the transfer.
-pub(super) struct Whole<'w> {
-    /// The program number: the sub-index of 1F50h and 1F57h.
-    pub(super) number: u8,
-    /// All that is sent.
-    pub(super) content: &'w [u8],
-    /// The word for it.
-    pub(super) doing: Doing,
-    /// The action at the start of each attempt.
-    pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut RunningUpdate<'_>) -> Result<(), Error>,
-    /// Reads the device's result of the download.
-    pub(super) status: fn(&mut Session<'_>, u8, Doing) -> Result<Said, Error>,
-}
-
-/// Steps 4 to 9 in one download of a program; `crcs` are its CRCs, as the device may compute them.
+/// Steps 4 to 9 in one download.
 ///
 /// # Errors
 /// The device's refusal.
 pub(super) fn download(
+    procedure: &(impl Procedure + ?Sized),
     session: &mut Session<'_>,
-    whole: &Whole<'_>,
-    crcs: [u32; 2],
+    file: &Payload,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
+    let number = update.options.program;
     let began = session.now();
-    let before = steps::told_before(session, whole.number)?;
+    let before = steps::crc_before(session, number)?;
     update.erases(before);
-    let repeats = send(session, whole, update)?;
+    let content = file.encoded(update.dialect.form());
+    let repeats = send(procedure, session, number, &content, Doing::Program, update)?;
     let took = session.now().saturating_sub(began);
     update.state = DeviceState::Written;
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
-        steps::verify(session, whole.number, crcs, &mut |event| update.tell(event))?;
+        steps::verify(session, number, file.crcs(), &mut |event| update.tell(event))?;
     }
     Ok(Downloaded { repeats, took, released: None, renewal: None })
 }
 
-/// Sends it, with the preparation before each attempt; returns the number of repetitions.
+/// Sends this content to a program, with the preparation before each attempt; returns the number of
+/// repetitions.
 ///
 /// # Errors
 /// The device's refusal.
 pub(super) fn send(
+    procedure: &(impl Procedure + ?Sized),
     session: &mut Session<'_>,
-    whole: &Whole<'_>,
+    number: u8,
+    content: &[u8],
+    doing: Doing,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
-    let Whole { number, content, doing, .. } = *whole;
     let at = Address::new(program::PROGRAM_DATA, number);
     let total = content.len();
-    let mut repeat = 0;
+    let mut repeats = Repeats { block: None, count: 0, of: update.options.repeats };
     loop {
-        if let Err(error) = (whole.prepare)(session, update) {
+        if let Err(error) = procedure.prepare(session, number, update) {
             // A refused password erases nothing, and neither does a refused command.
             if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
                 update.erases_not();
@@ -97,26 +86,14 @@ pub(super) fn send(
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }
-        let status = (whole.status)(session, number, doing)?;
-        let (why, error) = match judge(sent, status, doing) {
-            Judgement::Good => return Ok(repeat),
-            Judgement::Bad { why, error } => (why, error),
-        };
-        match why {
-            Some(why) if repeat < update.options.repeats => {
-                repeat += 1;
-                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
-                    session.transfer_by(Transfers::Segments);
-                }
-                update.tell(Event::Retry(Retry::program(repeat, update.options.repeats, why)));
-            }
-            _ => return Err(error),
-        }
+        let status = procedure.status(session, number, doing)?;
+        let Err(failure) = judge(sent, status, doing) else { return Ok(repeats.count) };
+        update.tell(Event::Retry(repeats.again(session, failure)?));
     }
 }
 
 /// The result of the download in 1F57h; `None` if the device does not have this object.
-pub(super) fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
+pub(super) fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
         Ok(_) | Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => {
@@ -127,7 +104,7 @@ pub(super) fn status(session: &mut Session<'_>, number: u8, doing: Doing) -> Res
 }
 
 /// The value of 1F57h when it is no longer busy.
-pub(super) fn idle(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<Said, Error> {
+pub(super) fn idle(session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
     let status = session.await_idle(number, doing)?;
     Ok(status.error.map(|error| (error, status.detail)))
 }
