@@ -510,7 +510,7 @@ impl Failure {
                 "what": self.what,
                 "device": self.left.map(|left| left.state.name()),
                 "seen": self.left.and_then(|left| match left.answer {
-                    DeviceAnswer::Seen(seen) => Some(json!({
+                    DeviceAnswer::Given(seen) => Some(json!({
                         "device_type": seen.running.0,
                         "bootloader": seen.running.is_bootloader(),
                         "control": seen.control,

@@ -33,6 +33,14 @@ pub struct Profile {
 }
 
 impl Profile {
+    /// All dialects: the name on a command line, and a line of help.
+    pub const ALL: [(&'static str, &'static str, Self); 4] = [
+        ("standard", "Block files, raw images and Intel HEX: the default of the firmware", Self::STANDARD),
+        ("paulus", "port's Paulus", Self::PAULUS),
+        ("esacademy", "The boot loader of ESAcademy: 7F50h unlocks 1F50h", Self::ESACADEMY),
+        ("lift", "CiA 417 lifts: 6005h unlocks 1F50h, node-ID 126", Self::LIFT),
+    ];
+
     /// SYS TEC block files, CiA 302-3 masters and their raw images, Intel HEX.
     pub const STANDARD: Self = Self {
         device_type: BOOTLOADER_DEVICE_TYPE,

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use boot_core::profile::Profile;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, ValueEnum};
 use coflash_core::file::board;
 use shared_abi::layout::{self, Layout};
@@ -73,8 +74,8 @@ pub struct Args {
     pub flash: FlashSpeed,
 
     /// The dialect of the nodes where dialects contradict each other
-    #[arg(long, value_enum, default_value = "standard")]
-    pub profile: Dialect,
+    #[arg(long, default_value = "standard", value_parser = profiles())]
+    pub profile: Profile,
 
     /// Protect blocks and programs with a CRC-16, as in a product with `CrcKind::Crc16`; `coflash
     /// convert --crc16` makes such files
@@ -96,28 +97,13 @@ pub struct Args {
     pub run: Option<Command>,
 }
 
-/// The dialects of docs/dialects.md.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-pub enum Dialect {
-    /// Block files, raw images and Intel HEX: the default of the firmware
-    Standard,
-    /// port's Paulus
-    Paulus,
-    /// The boot loader of ESAcademy: 7F50h unlocks 1F50h
-    Esacademy,
-    /// CiA 417 lifts: 6005h unlocks 1F50h, node-ID 126
-    Lift,
-}
-
-impl From<Dialect> for Profile {
-    fn from(dialect: Dialect) -> Self {
-        match dialect {
-            Dialect::Standard => Self::STANDARD,
-            Dialect::Paulus => Self::PAULUS,
-            Dialect::Esacademy => Self::ESACADEMY,
-            Dialect::Lift => Self::LIFT,
-        }
-    }
+/// The dialects of docs/dialects.md, by their names.
+fn profiles() -> impl TypedValueParser<Value = Profile> {
+    let word = |(name, help, _)| PossibleValue::new(name).help(help);
+    PossibleValuesParser::new(Profile::ALL.map(word)).map(|word| {
+        let named = Profile::ALL.into_iter().find(|(name, ..)| *name == word);
+        named.map_or(Profile::STANDARD, |(.., profile)| profile)
+    })
 }
 
 /// The duration of the flash's operations.

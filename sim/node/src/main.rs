@@ -118,7 +118,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
 
 /// The setups of the nodes, which live as long as the process.
 fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
-    let profile: Profile = args.profile.into();
+    let profile = args.profile;
     let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
         entries: table_of(programs, profile.extras),
         device: device::Device {

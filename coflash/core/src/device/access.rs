@@ -12,7 +12,7 @@ use seal::wire::{array, word};
 use serde::Serialize;
 
 use super::doing::Doing;
-use super::error::{roots_words, told, Error};
+use super::error::{reported, roots_words, Error};
 use super::session::Session;
 use crate::json;
 
@@ -77,12 +77,8 @@ pub fn challenge(session: &mut Session<'_>) -> Result<Challenge, Error> {
 ///
 /// # Errors
 /// The errors of [`challenge`], except a refusal.
-pub fn told_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Error> {
-    match session.read(Address::new(ACCESS, 1)) {
-        Ok(bytes) => Ok(bytes.try_into().ok().map(Challenge)),
-        Err(Error::Refused { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
+pub fn reported_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Error> {
+    reported(challenge(session))
 }
 
 /// What a device reports about the images that it takes. `Display` shows it in one line.
@@ -106,7 +102,7 @@ pub struct Security {
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.
 pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
-    match told_challenge(session)? {
+    match reported_challenge(session)? {
         Some(challenge) => security_of(session, &challenge).map(Some),
         None => Ok(None),
     }
@@ -117,7 +113,7 @@ pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
 /// # Errors
 /// [`Error::SealedOnly`], and the errors of a [read](Session::read).
 pub(crate) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
-    match told_challenge(session)? {
+    match reported_challenge(session)? {
         Some(challenge) if challenge.is_sealed() => {
             let roots = security_of(session, &challenge)?.roots;
             Err(Error::SealedOnly { node: session.node(), roots })
@@ -131,7 +127,7 @@ pub(crate) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
 /// # Errors
 /// Those of [`security`].
 pub(crate) fn security_of(session: &mut Session<'_>, challenge: &Challenge) -> Result<Security, Error> {
-    let bytes = told(session.read(Address::new(ACCESS, 3)))?.unwrap_or_default();
+    let bytes = reported(session.read(Address::new(ACCESS, 3)))?.unwrap_or_default();
     let mut words = bytes.chunks_exact(4).map(|bytes| word(bytes, 0));
     Ok(Security {
         sealed: challenge.is_sealed(),

@@ -18,7 +18,7 @@ use super::session::Session;
 /// The most bytes that one command reads or writes.
 const CHUNK: u32 = 4096;
 /// The pause between two status requests while no emergency reports a stop.
-const LOOK: Duration = Duration::from_millis(200);
+const STATUS_PERIOD: Duration = Duration::from_millis(200);
 
 const FP_CTRL: u32 = 0xE000_2000;
 const FP_CTRL_ON: u32 = 0b11;
@@ -292,7 +292,7 @@ impl<'s, 'a> Debugger<'s, 'a> {
                 }
             }
             let mut heard = None;
-            self.session.observe_until(left.min(LOOK), &mut |frame| {
+            self.session.observe_until(left.min(STATUS_PERIOD), &mut |frame| {
                 heard = stop_of(frame, CobId::emcy(node));
                 heard.is_some()
             })?;
@@ -378,8 +378,8 @@ mod tests {
     fn a_stop_is_an_emergency_of_this_node() {
         let id = CobId::new(0x81).unwrap();
         let frame = |id: u16, data: &[u8]| Frame::of(CobId::new(id).unwrap(), data);
-        let told = stop_of(&frame(0x81, &[0, 0x62, 0, 1, 0x44, 0x23, 1, 8]), id);
-        assert_eq!(told, Some(Stopped { stop: Stop::Breakpoint, address: 0x0801_2344 }));
+        let reported = stop_of(&frame(0x81, &[0, 0x62, 0, 1, 0x44, 0x23, 1, 8]), id);
+        assert_eq!(reported, Some(Stopped { stop: Stop::Breakpoint, address: 0x0801_2344 }));
         for (id_of, data) in [
             (0x82, &[0, 0x62, 0, 1, 0x44, 0x23, 1, 8][..]),
             (0x81, &[0, 0x63, 0, 1, 0x44, 0x23, 1, 8]),

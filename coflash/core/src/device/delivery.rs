@@ -8,7 +8,7 @@ use canopen::Address;
 use serde::{Serialize, Serializer};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
-use super::error::{told, Error};
+use super::error::{reported, Error};
 use super::option_bytes::OptionBytes;
 use super::renewal::progress;
 use super::session::Session;
@@ -123,7 +123,7 @@ pub fn delivery(session: &mut Session<'_>) -> Result<Delivery, Error> {
     let (mut faults, mut untold) = (Vec::new(), Vec::new());
     let mut number = |sub| {
         let at = Address::new(DEVICE_STATE, sub);
-        let value = told(session.read_number(at))?;
+        let value = reported(session.read_number(at))?;
         if value.is_none() {
             untold.push(at);
         }
@@ -139,7 +139,7 @@ pub fn delivery(session: &mut Session<'_>) -> Result<Delivery, Error> {
         faults.push(Fault::SecondBank);
     }
     if renewal == Some(true) {
-        match told(progress(session))?.flatten() {
+        match reported(progress(session))?.flatten() {
             Some(progress) => faults.extend(Fault::of(progress)),
             // None, or a state of a later version.
             None => untold.push(Address::new(DEVICE_STATE, STATE_RENEWAL)),

@@ -667,18 +667,9 @@ pub(crate) fn roots_words(roots: &[u32]) -> String {
     format!("{noun} {}", ids.join(", "))
 }
 
-/// Turns the error "no such object" into `None`.
-pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
-    match read {
-        Ok(value) => Ok(Some(value)),
-        Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
-        Err(error) => Err(error),
-    }
-}
-
 /// Turns any refusal, and a value of another length than its type has, into `None`: an object that
 /// a device need not have costs nothing else.
-pub(crate) fn told<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+pub(crate) fn reported<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(value) => Ok(Some(value)),
         Err(Error::Refused { .. } | Error::Protocol { code: AbortCode::LENGTH, .. }) => Ok(None),

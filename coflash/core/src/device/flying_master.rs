@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use canopen::{Address, CobId, Frame, NodeId};
 
-use super::error::{optional, Error};
+use super::error::Error;
 use super::session::Session;
 use super::timing::Timing;
 
@@ -171,9 +171,8 @@ fn milliseconds(
     (sub, default): (u8, u32),
 ) -> Result<Duration, Error> {
     let timing = Timing { attempts: 1, ..*session.timing() };
-    let told = optional(session.with(node, timing).read_number(Address::new(TIMING, sub)));
-    let time = match told {
-        Ok(time) => time.unwrap_or(default),
+    let time = match session.with(node, timing).read_number(Address::new(TIMING, sub)) {
+        Ok(time) => time,
         Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
         Err(_) => default,
     };

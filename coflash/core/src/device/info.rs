@@ -11,7 +11,7 @@ use shared_abi::block_file::ProgramVersion;
 use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
-use super::error::{detail_words, failure_words, told, Error};
+use super::error::{detail_words, failure_words, reported, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
 use super::renewal::{self, Bootloader};
@@ -176,12 +176,12 @@ fn cell<T>(
     session: &mut Session<'_>,
     read: impl FnOnce(&mut Session<'_>) -> Result<T, Error>,
 ) -> Result<Option<T>, Error> {
-    match told(read(session)) {
+    match reported(read(session)) {
         Err(error @ Error::NoAnswer { .. }) => match session.device_type()? {
             Some(_) => Ok(None),
             None => Err(error),
         },
-        told => told,
+        reported => reported,
     }
 }
 
@@ -215,7 +215,7 @@ pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
 /// # Errors
 /// As [`info`].
 pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInfo, Error> {
-    let mut number = |index| told(session.read_number(Address::new(index, program)));
+    let mut number = |index| reported(session.read_number(Address::new(index, program)));
     let control = number(program::PROGRAM_CONTROL)?;
     let crc = number(program::PROGRAM_ID)?;
     let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);
@@ -223,30 +223,39 @@ pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInf
     Ok(ProgramInfo { number: program, control, crc, version, status })
 }
 
+const NOT_REPORTED: &str = "not reported";
+
+/// A text that a device need not have, in words.
+fn text(value: Option<&str>) -> &str {
+    value.unwrap_or(NOT_REPORTED)
+}
+
+/// A part of an identity in words.
+pub(crate) fn hex(part: Option<u32>) -> String {
+    part.map_or(NOT_REPORTED.to_owned(), |part| format!("{part:08X}h"))
+}
+
 impl fmt::Display for DeviceInfo {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        const ABSENT: &str = "not reported";
-        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| ABSENT.to_string());
-        let hex = |value: Option<u32>| value.map_or(ABSENT.to_string(), |value| format!("{value:08X}h"));
         let [vendor, product, revision, serial] = self.identity.map(hex);
         writeln!(f, "node {}: {}", self.node, self.device_type)?;
         for (name, value) in [
-            ("device name", text(&self.name)),
-            ("hardware version", text(&self.hardware_version)),
-            ("software version", text(&self.software_version)),
-            ("vendor-ID", vendor),
-            ("product code", product),
-            ("revision", revision),
-            ("serial number", serial),
+            ("device name", text(self.name.as_deref())),
+            ("hardware version", text(self.hardware_version.as_deref())),
+            ("software version", text(self.software_version.as_deref())),
+            ("vendor-ID", &vendor),
+            ("product code", &product),
+            ("revision", &revision),
+            ("serial number", &serial),
             (
                 "error register",
-                match self.error_register {
-                    None => ABSENT.to_string(),
+                &match self.error_register {
+                    None => NOT_REPORTED.to_string(),
                     Some(0) => "00h (no error)".to_string(),
                     Some(bits) => format!("{bits:02X}h"),
                 },
             ),
-            ("dialect", self.dialect.map_or(ABSENT.to_string(), |dialect| dialect.to_string())),
+            ("dialect", &self.dialect.map_or(NOT_REPORTED.to_string(), |dialect| dialect.to_string())),
         ] {
             writeln!(f, "  {name:<17} {value}")?;
         }
@@ -274,17 +283,14 @@ impl fmt::Display for DeviceInfo {
 
 impl fmt::Display for Nameplate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "not reported".to_string());
-        let hex =
-            |value: Option<u32>| value.map_or("not reported".to_string(), |value| format!("{value:08X}h"));
         let [vendor, product, revision, serial] = self.identity.map(hex);
         write!(
             f,
             "{}, hardware {}, software {}, vendor-ID {vendor}, product code {product}, revision {revision}, \
              serial number {serial}",
-            text(&self.name),
-            text(&self.hardware_version),
-            text(&self.software_version)
+            text(self.name.as_deref()),
+            text(self.hardware_version.as_deref()),
+            text(self.software_version.as_deref())
         )
     }
 }

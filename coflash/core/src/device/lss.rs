@@ -1,7 +1,7 @@
 //! The master of layer setting services (CiA 305): sets node-ID and bit rate over the bus, for
 //! devices without switches.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -46,7 +46,7 @@ const STORE_UNSUPPORTED: u8 = 1;
 pub struct Master<'a> {
     adapter: &'a mut dyn Adapter,
     answer: Duration,
-    cancelled: Option<Arc<AtomicBool>>,
+    cancelled: Arc<AtomicBool>,
 }
 
 impl std::fmt::Debug for Master<'_> {
@@ -58,12 +58,12 @@ impl std::fmt::Debug for Master<'_> {
 impl<'a> Master<'a> {
     /// A master that waits `answer` for each answer ([`ANSWER`]). It sends nothing yet.
     pub fn new(adapter: &'a mut dyn Adapter, answer: Duration) -> Self {
-        Self { adapter, answer, cancelled: None }
+        Self { adapter, answer, cancelled: Arc::default() }
     }
 
     /// Ends with [`Error::Cancelled`] when `flag` is set.
     pub fn cancel_by(&mut self, flag: Arc<AtomicBool>) {
-        self.cancelled = Some(flag);
+        self.cancelled = flag;
     }
 
     /// Switches all devices into configuration state, or back to waiting state. No device answers.
@@ -239,7 +239,6 @@ impl<'a> Master<'a> {
     }
 
     fn send(&mut self, request: [u8; 8]) -> Result<(), Error> {
-        self.check_cancelled()?;
         Ok(self.adapter.send(&Frame::of(CobId::LSS_REQUEST, &request))?)
     }
 
@@ -253,30 +252,13 @@ impl<'a> Master<'a> {
     }
 
     fn await_answer(&mut self, command: u8, within: Duration) -> Result<Option<[u8; 8]>, Error> {
-        let deadline = self.adapter.now() + within;
-        loop {
-            self.check_cancelled()?;
-            let left = deadline.saturating_sub(self.adapter.now());
-            if let Some(frame) = self.adapter.receive(left)? {
-                let bytes: Option<&[u8; 8]> = frame.exactly();
-                match bytes {
-                    Some(bytes) if frame.cob_id() == Some(CobId::LSS_RESPONSE) && bytes[0] == command => {
-                        return Ok(Some(*bytes))
-                    }
-                    _ => {}
-                }
-            }
-            if self.adapter.now() >= deadline {
-                return Ok(None);
-            }
-        }
-    }
-
-    fn check_cancelled(&self) -> Result<(), Error> {
-        match &self.cancelled {
-            Some(flag) if flag.load(Ordering::Relaxed) => Err(Error::Cancelled),
-            _ => Ok(()),
-        }
+        let mut answer = None;
+        listen(self.adapter, within, &self.cancelled, &mut |frame| {
+            let of_master = frame.cob_id() == Some(CobId::LSS_RESPONSE);
+            answer = frame.exactly::<8>().copied().filter(|bytes| of_master && bytes[0] == command);
+            answer.is_some()
+        })?;
+        Ok(answer)
     }
 }
 

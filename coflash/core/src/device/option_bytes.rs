@@ -173,7 +173,7 @@ mod tests {
 
     #[test]
     fn what_is_wrong_for_a_product_is_told_with_the_cure() {
-        let told = |value, words: &[&str]| {
+        let reported = |value, words: &[&str]| {
             let warnings = OptionBytes(value).warnings();
             assert_eq!(warnings.len(), words.len(), "{value:08X}h: {warnings:?}");
             for (warning, word) in warnings.iter().zip(words) {
@@ -181,15 +181,15 @@ mod tests {
             }
         };
         // Level 3 and sector 0 protected, all the same what else is protected.
-        told(0x0FFE_AAE1, &[]);
-        told(0x0000_CCE1, &[]);
-        told(0x0FFF_AAED, &["brown-out reset is off", "not write-protected"]);
-        told(0x0FFE_AAED, &["brown-out reset is off"]);
+        reported(0x0FFE_AAE1, &[]);
+        reported(0x0000_CCE1, &[]);
+        reported(0x0FFF_AAED, &["brown-out reset is off", "not write-protected"]);
+        reported(0x0FFE_AAED, &["brown-out reset is off"]);
         // Sector 4 alone.
-        told(0x0FEF_AAE1, &["not write-protected"]);
-        told(0x0FFE_AAC1, &["within 349 ms"]);
-        told(0x0FFE_AAF1, &["BFB2"]);
-        told(0x8001_AAE1, &["SPRMOD"]);
-        told(0x8000_AACD, &["brown-out", "SPRMOD", "not write-protected", "watchdog"]);
+        reported(0x0FEF_AAE1, &["not write-protected"]);
+        reported(0x0FFE_AAC1, &["within 349 ms"]);
+        reported(0x0FFE_AAF1, &["BFB2"]);
+        reported(0x8001_AAE1, &["SPRMOD"]);
+        reported(0x8000_AACD, &["brown-out", "SPRMOD", "not write-protected", "watchdog"]);
     }
 }

@@ -3,7 +3,7 @@
 use canopen::program::{region_of, PROGRAM_PARTIAL};
 use canopen::Address;
 
-use super::error::Error;
+use super::error::{reported, Error};
 use super::session::Session;
 
 /// The download of a block file that a device has begun and not ended.
@@ -29,11 +29,8 @@ impl PartialDownload {
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.
 pub fn partial_download(session: &mut Session<'_>, program: u8) -> Result<Option<PartialDownload>, Error> {
-    match session.read(Address::new(PROGRAM_PARTIAL, program)) {
-        Ok(value) => Ok(PartialDownload::parse(&value)),
-        Err(Error::Refused { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
+    let value = reported(session.read(Address::new(PROGRAM_PARTIAL, program)))?;
+    Ok(value.and_then(|value| PartialDownload::parse(&value)))
 }
 
 #[cfg(test)]

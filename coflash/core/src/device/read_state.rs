@@ -8,7 +8,7 @@ use canopen::program::{
 };
 use canopen::Address;
 
-use super::error::{told, Error};
+use super::error::{reported, Error};
 use super::option_bytes::OptionBytes;
 use super::session::Session;
 use super::state::BootloaderState;
@@ -18,7 +18,7 @@ use super::state::BootloaderState;
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn read_state(session: &mut Session<'_>) -> Result<Option<BootloaderState>, Error> {
-    let mut number = |sub| told(session.read_number(Address::new(DEVICE_STATE, sub)));
+    let mut number = |sub| reported(session.read_number(Address::new(DEVICE_STATE, sub)));
     let mut byte = |sub| Ok::<_, Error>(number(sub)?.map(|value| value as u8));
     let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
     let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
@@ -39,7 +39,7 @@ pub(crate) fn state_after_failure(session: &mut Session<'_>) -> Option<Bootloade
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn program_start(session: &mut Session<'_>) -> Result<Option<ProgramStart>, Error> {
-    let word = told(session.read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)))?;
+    let word = reported(session.read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)))?;
     Ok(word.map(ProgramStart::of_word))
 }
 

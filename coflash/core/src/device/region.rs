@@ -3,7 +3,7 @@
 use canopen::program::{region_of, PROGRAM_REGION};
 use canopen::Address;
 
-use super::error::Error;
+use super::error::{reported, Error};
 use super::session::Session;
 
 /// Main flash of the STM32F4: 08000000h, at most 2 MiB.
@@ -42,11 +42,8 @@ impl ProgramRegion {
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.
 pub fn program_region(session: &mut Session<'_>, program: u8) -> Result<Option<ProgramRegion>, Error> {
-    match session.read(Address::new(PROGRAM_REGION, program)) {
-        Ok(value) => Ok(ProgramRegion::parse(&value)),
-        Err(Error::Refused { .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
+    let value = reported(session.read(Address::new(PROGRAM_REGION, program)))?;
+    Ok(value.and_then(|value| ProgramRegion::parse(&value)))
 }
 
 #[cfg(test)]

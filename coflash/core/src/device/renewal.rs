@@ -9,7 +9,7 @@ use serde::{Serialize, Serializer};
 use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
-use super::error::{told, Error};
+use super::error::{reported, Error};
 use super::session::Session;
 use super::state::trial_end;
 use crate::advice::Advice;
@@ -40,7 +40,7 @@ pub struct Running {
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn number(session: &mut Session<'_>) -> Result<Option<u8>, Error> {
-    let number = told(session.read_number(Address::new(DEVICE_STATE, STATE_BOOTLOADER)))?;
+    let number = reported(session.read_number(Address::new(DEVICE_STATE, STATE_BOOTLOADER)))?;
     Ok(number.and_then(|number| u8::try_from(number).ok()).filter(|number| *number != 0))
 }
 
@@ -49,7 +49,7 @@ pub fn number(session: &mut Session<'_>) -> Result<Option<u8>, Error> {
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn asleep(session: &mut Session<'_>, number: u8) -> Result<Option<Bootloader>, Error> {
-    let version = told(session.read_number(Address::new(PROGRAM_VERSION, number)))?;
+    let version = reported(session.read_number(Address::new(PROGRAM_VERSION, number)))?;
     Ok(version.map(|version| Bootloader { number, version: Version(version), running: None }))
 }
 
@@ -59,7 +59,7 @@ pub fn asleep(session: &mut Session<'_>, number: u8) -> Result<Option<Bootloader
 /// Those of a [read](Session::read).
 pub fn bootloader(session: &mut Session<'_>) -> Result<Option<Bootloader>, Error> {
     let Some(number) = number(session)? else { return Ok(None) };
-    let versions = told(session.read(Address::new(DEVICE_STATE, STATE_VERSIONS)))?.unwrap_or_default();
+    let versions = reported(session.read(Address::new(DEVICE_STATE, STATE_VERSIONS)))?.unwrap_or_default();
     let word = |at: usize| {
         let bytes = versions.get(at..at + 4).and_then(|bytes| bytes.try_into().ok());
         bytes.map_or(0, u32::from_le_bytes)

@@ -96,10 +96,10 @@ pub fn scan(
     for node in answered {
         let mut session = Session::new(adapter, node, options.timing);
         session.cancel_by(cancelled.clone());
-        let told = info(&mut session);
+        let reported = info(&mut session);
         let found = found.entry(node).or_default();
-        match told {
-            Ok(told) => found.info = Some(told),
+        match reported {
+            Ok(reported) => found.info = Some(reported),
             Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
             Err(error) => found.but = Some(but(&error)),
         }

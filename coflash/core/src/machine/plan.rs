@@ -12,7 +12,7 @@ use serde::{Serialize, Serializer};
 use super::fault::{DeviceFault, Fault};
 use super::manifest::Entry;
 use super::package::{version, Package};
-use crate::device::info::{self, program_info, DeviceInfo, ProgramInfo};
+use crate::device::info::{self, hex, program_info, DeviceInfo, ProgramInfo};
 use crate::device::scan::{scan, Found, ScanOptions};
 use crate::device::{Error, Session};
 use crate::json;
@@ -283,11 +283,6 @@ fn differs(entry: &Entry, node: NodeId, info: &DeviceInfo) -> Option<DeviceFault
             package: hex(wanted),
         },
     )
-}
-
-/// A part of an identity in words.
-pub(super) fn hex(part: Option<u32>) -> String {
-    part.map_or("not reported".to_owned(), |part| format!("{part:08X}h"))
 }
 
 /// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not

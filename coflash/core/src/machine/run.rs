@@ -8,12 +8,12 @@ use canopen::NodeId;
 use super::fault::DeviceFault;
 use super::manifest::Entry;
 use super::package::Package;
-use super::plan::{hex, Device, Plan, Todo};
-use crate::device::info::identity;
+use super::plan::{Device, Plan, Todo};
+use crate::device::info::{hex, identity};
 use crate::device::{Error, Session};
 use crate::file::Target;
 use crate::update::event::Event;
-use crate::update::many::{self, flash_many, Failed, Job, ManyOptions};
+use crate::update::many::{flash_many, Failed, Job, ManyOptions};
 use crate::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report};
 use coboot_can::Adapter;
 
@@ -62,7 +62,7 @@ pub enum Bad {
 /// are updated together where they can. Before that, the identity of each device is compared with the plan
 /// again. If one fails, the others go on; a device gets nothing more after a program that failed.
 ///
-/// `tell` gets the events of each device, on separate threads. The outcomes are in the order of the package.
+/// `on_event` gets the events of each device, on separate threads. The outcomes are in the order of the package.
 /// An interrupted run is continued by a new plan: devices that have their program are not written again, and
 /// a download that was cut off goes on.
 pub fn run(
@@ -70,7 +70,7 @@ pub fn run(
     package: &Package,
     plan: &Plan,
     options: &RunOptions,
-    tell: &(dyn Fn(NodeId, usize, Event) + Sync),
+    on_event: &(dyn Fn(NodeId, usize, Event) + Sync),
 ) -> Vec<Outcome> {
     let mut failed: BTreeSet<NodeId> = BTreeSet::new();
     let mut outcomes = Vec::new();
@@ -102,7 +102,7 @@ pub fn run(
                 }
             }
         }
-        ended.extend(update(adapter, at, entry, program, &due, options, tell));
+        ended.extend(update(adapter, at, entry, program, &due, options, on_event));
         ended.sort_by_key(|(node, _)| *node);
         failed.extend(ended.iter().filter(|(_, result)| result.is_err()).map(|(node, _)| *node));
         outcomes.extend(ended.into_iter().map(|(node, result)| Outcome {
@@ -166,7 +166,7 @@ fn update(
     program: &Payload,
     devices: &[(NodeId, Target)],
     options: &RunOptions,
-    tell: &(dyn Fn(NodeId, usize, Event) + Sync),
+    on_event: &(dyn Fn(NodeId, usize, Event) + Sync),
 ) -> Vec<(NodeId, Result<Good, Bad>)> {
     let flash = FlashOptions {
         // A renewal finds the number of the bootloader by itself.
@@ -180,23 +180,11 @@ fn update(
         Job::new(*node, program.clone(), flash.check_target(Some(*target)))
     };
     let jobs: Vec<Job> = devices.iter().map(job).collect();
-    let results = match jobs.as_slice() {
-        [] => Vec::new(),
-        // A device alone can be followed to another node-ID, which lifts need.
-        [job] => {
-            let mut session = Session::new(adapter, job.node, options.many.timing);
-            let tell = &mut |event| tell(job.node, at, event);
-            vec![many::update(&mut session, job, &job.options, &options.many, tell)]
+    let results = flash_many(adapter, &jobs, &options.many, &|number, event| {
+        if let Some(job) = jobs.get(number) {
+            on_event(job.node, at, event);
         }
-        jobs => {
-            let tell = |number: usize, event| {
-                if let Some(job) = jobs.get(number) {
-                    tell(job.node, at, event);
-                }
-            };
-            flash_many(adapter, jobs, &options.many, &tell)
-        }
-    };
+    });
     let good = |result: Result<Report, Failed>| result.map(Good::Updated).map_err(Bad::Failed);
     devices.iter().map(|(node, _)| *node).zip(results.into_iter().map(good)).collect()
 }

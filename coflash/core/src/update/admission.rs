@@ -11,8 +11,8 @@ use super::options::FlashOptions;
 use super::payload::{refusal_number, Payload};
 use super::steps::compare_target;
 use crate::advice::Advice;
-use crate::device::access::{security_of, takes_open, told_challenge, Challenge};
-use crate::device::error::{told, Error, IdentityPart};
+use crate::device::access::{reported_challenge, security_of, takes_open, Challenge};
+use crate::device::error::{reported, Error, IdentityPart};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Form, Session};
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
@@ -118,7 +118,7 @@ impl Question<'_> {
             Self::Target(program) => {
                 // A value that the device does not report cannot differ.
                 for target in program.targets().into_iter().flatten() {
-                    compare_target(session, target, |session, at| told(session.read_number(at)))?;
+                    compare_target(session, target, |session, at| reported(session.read_number(at)))?;
                 }
                 Ok(true)
             }
@@ -138,7 +138,8 @@ fn admit_manifest(session: &mut Session<'_>, file: &SealedFile, program: u8) -> 
     }
     // 0 is a normal value here: it only matches a device with the identity 0.
     for (sub, file) in [(1, head.vendor_id()), (2, head.product_code())] {
-        if let Some(device) = told(session.read_number(Address::new(IDENTITY, sub)))?.filter(|it| *it != file)
+        if let Some(device) =
+            reported(session.read_number(Address::new(IDENTITY, sub)))?.filter(|it| *it != file)
         {
             return Err(Error::WrongTarget {
                 node: session.node(),
@@ -154,7 +155,7 @@ fn admit_manifest(session: &mut Session<'_>, file: &SealedFile, program: u8) -> 
 /// Checks what the bootloader reports and an application may not: whether the device accepts sealed
 /// images, and of which age. Returns whether the device has reported it.
 fn takes_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<bool, Error> {
-    match told_challenge(session)? {
+    match reported_challenge(session)? {
         Some(challenge) if !challenge.is_sealed() => {
             let why = "cannot be installed: the device is not sealed and has no keys to check the image";
             Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice: Advice::Provision })
@@ -206,7 +207,7 @@ fn admit_image(session: &mut Session<'_>, program: &Program) -> Result<bool, Err
     if StackAtEnd::of(image, start).is_none() {
         return Ok(true);
     }
-    let Some(name) = told(session.read_text(Address::new(DEVICE_NAME, 0)))? else { return Ok(false) };
+    let Some(name) = reported(session.read_text(Address::new(DEVICE_NAME, 0)))? else { return Ok(false) };
     let board = name.strip_prefix("coboot ").and_then(|name| layout::by_name(&name.to_lowercase()));
     judge(image, start, board).map_err(no_program)?;
     Ok(true)
@@ -219,8 +220,8 @@ fn admit_place(
     dialect: Dialect,
     number: u8,
 ) -> Result<bool, Error> {
-    let Some(told) = program_region(session, number)? else { return Ok(false) };
-    let region = AddressRange { first: told.base, last: told.last() };
+    let Some(reported) = program_region(session, number)? else { return Ok(false) };
+    let region = AddressRange { first: reported.base, last: reported.last() };
     let (image, start, size) = (program.image(), program.start(), u64::from(program.size()));
     let fits = match dialect.form() {
         // The CRC of the program counts from the region's start.

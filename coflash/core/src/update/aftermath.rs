@@ -6,9 +6,9 @@ use std::time::Duration;
 use canopen::program::{self, FlashError};
 use canopen::Address;
 
-use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen};
+use super::device_after::{Answers, DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::running::RunningUpdate;
-use crate::device::error::{told, Error};
+use crate::device::error::{reported, Error};
 use crate::device::{DeviceType, Session, Timing};
 
 /// How long the device may take for its answer; there are two attempts.
@@ -16,17 +16,17 @@ const ANSWER: Duration = Duration::from_millis(500);
 
 /// Asks the device for its state after the update. `crcs` are the values that 1F56h may have with the
 /// file's program.
-pub(super) fn look(
+pub(super) fn state_after(
     session: &mut Session<'_>,
     error: &Error,
     update: &RunningUpdate<'_>,
     number: u8,
     crcs: [u32; 2],
 ) -> DeviceAfterUpdate {
-    let unseen = |answer| DeviceAfterUpdate { state: update.last_known(), answer };
+    let without = |answer| DeviceAfterUpdate { state: update.last_known(), answer };
     let untouched = update.state == DeviceState::Untouched && !update.touched;
     if untouched || matches!(error, Error::Adapter(_)) {
-        return unseen(DeviceAnswer::NotAsked);
+        return without(DeviceAnswer::NotAsked);
     }
     let (current, original) = (session.node(), update.original);
     let nodes = [current, original];
@@ -35,25 +35,25 @@ pub(super) fn look(
         let mut asked = session.with(*node, timing);
         asked.cancel_by_nobody();
         match ask(&mut asked, number) {
-            Ok(seen) => {
+            Ok(answers) => {
                 return DeviceAfterUpdate {
-                    state: judge(update, &seen, crcs, error),
-                    answer: DeviceAnswer::Seen(seen),
+                    state: judge(update, &answers, crcs, error),
+                    answer: DeviceAnswer::Given(answers),
                 }
             }
-            Err(Error::Adapter(_)) => return unseen(DeviceAnswer::NotAsked),
+            Err(Error::Adapter(_)) => return without(DeviceAnswer::NotAsked),
             Err(_) => {}
         }
     }
-    unseen(DeviceAnswer::Silent)
+    without(DeviceAnswer::Silent)
 }
 
-fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
+fn ask(session: &mut Session<'_>, number: u8) -> Result<Answers, Error> {
     let running = DeviceType(session.read_number(Address::new(program::DEVICE_TYPE, 0))?);
-    let mut object = |index| told(session.read_number(Address::new(index, number)));
+    let mut object = |index| reported(session.read_number(Address::new(index, number)));
     let control = object(program::PROGRAM_CONTROL)?;
     let crc = object(program::PROGRAM_ID)?;
-    Ok(Seen { running, control, crc })
+    Ok(Answers { running, control, crc })
 }
 
 /// Whether a sealed image was refused as not authentic, too old, or for other keys: a device erases
@@ -64,15 +64,17 @@ fn is_not_admitted(error: &Error) -> bool {
 }
 
 /// The state of a device, from the course of the update, its error and the device's answers.
-fn judge(update: &RunningUpdate<'_>, seen: &Seen, crcs: [u32; 2], error: &Error) -> DeviceState {
+fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &Error) -> DeviceState {
     let wrote = update.wrote && !is_not_admitted(error);
     match update.state {
         // The application was called and has stayed, or is back.
-        DeviceState::Called if !seen.running.is_bootloader() => DeviceState::Untouched,
-        DeviceState::Erased if !seen.empty() => match seen.crc {
+        DeviceState::Called if !answers.running.is_bootloader() => DeviceState::Untouched,
+        DeviceState::Erased if !answers.empty() => match answers.crc {
             // A device that erases with the first good block has received none.
-            told @ Some(_) if !wrote && told == update.before => update.resting,
-            Some(told) if wrote && crcs.contains(&told) && seen.control.is_some() => DeviceState::Unreleased,
+            reported @ Some(_) if !wrote && reported == update.before => update.state_before,
+            Some(reported) if wrote && crcs.contains(&reported) && answers.control.is_some() => {
+                DeviceState::Unreleased
+            }
             _ => DeviceState::Erased,
         },
         state => state,

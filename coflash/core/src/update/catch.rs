@@ -15,7 +15,7 @@ use crate::device::{DeviceType, Doing, Error, Session, Timing};
 
 /// The longest pause between two requests, including the wait for the answer: a third of the rescue
 /// window.
-const KNOCK: Duration = Duration::from_millis(100);
+const REQUEST_PERIOD: Duration = Duration::from_millis(100);
 
 /// "Identify non-configured remote slave" (CiA 305): a device without a node-ID answers it with
 /// 50h, and all other devices ignore it. It changes nothing in a device.
@@ -55,29 +55,29 @@ pub struct Caught {
 pub fn catch(
     session: &mut Session<'_>,
     options: &CatchOptions,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<Caught, Error> {
     let deadline = options.within.map(|time| session.now() + time);
     if options.any {
-        return catch_anybody(session, deadline, tell);
+        return catch_anybody(session, deadline, on_event);
     }
     loop {
-        let running = knock(session, deadline, tell)?;
-        tell(Event::Found(running));
+        let running = search(session, deadline, on_event)?;
+        on_event(Event::Found(running));
         if running.is_bootloader() {
             return Ok(Caught { node: Some(session.node()), running: Some(running) });
         }
-        tell(Phase::CallingBack.into());
+        on_event(Phase::CallingBack.into());
         match call_back(session) {
             Ok(running) => {
-                tell(Phase::InBootloader.into());
+                on_event(Phase::InBootloader.into());
                 return Ok(Caught { node: Some(session.node()), running: Some(running) });
             }
             Err(error @ (Error::NoAnswer { .. } | Error::NoBootloader { .. })) => {
                 if deadline.is_some_and(|deadline| session.now() >= deadline) {
                     return Err(error);
                 }
-                tell(Phase::Searching { reason: error.to_string() }.into());
+                on_event(Phase::Searching { reason: error.to_string() }.into());
                 let pause = session.timing().poll_most;
                 session.wait(pause)?;
             }
@@ -89,14 +89,14 @@ pub fn catch(
 /// Sends requests until a device answers; returns its device type.
 /// # Errors
 /// [`Error::NoAnswer`] at the deadline, [`Error::Adapter`], [`Error::Cancelled`].
-pub(super) fn knock(
+pub(super) fn search(
     session: &mut Session<'_>,
     deadline: Option<Duration>,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<DeviceType, Error> {
     let node = session.node();
-    let timing = Timing { sdo: KNOCK.min(session.timing().sdo), attempts: 1, ..*session.timing() };
-    let mut told = false;
+    let timing = Timing { sdo: REQUEST_PERIOD.min(session.timing().sdo), attempts: 1, ..*session.timing() };
+    let mut reported = false;
     loop {
         if let Some(running) = session.with(node, timing).device_type()? {
             return Ok(running);
@@ -105,8 +105,8 @@ pub(super) fn knock(
         if deadline.is_some_and(|deadline| session.now() >= deadline) {
             return Err(error);
         }
-        if !std::mem::replace(&mut told, true) {
-            tell(Phase::Searching { reason: error.to_string() }.into());
+        if !std::mem::replace(&mut reported, true) {
+            on_event(Phase::Searching { reason: error.to_string() }.into());
         }
         let pause = session.timing().poll_first;
         session.await_boot_up(pause)?;
@@ -122,13 +122,13 @@ enum Heard {
 fn catch_anybody(
     session: &mut Session<'_>,
     deadline: Option<Duration>,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<Caught, Error> {
-    tell(Phase::Searching { reason: "no device has started".to_string() }.into());
+    on_event(Phase::Searching { reason: "no device has started".to_string() }.into());
     loop {
         session.send(&Frame::of(CobId::LSS_REQUEST, &ANYBODY))?;
         let mut heard = None;
-        session.observe_until(KNOCK, &mut |frame| {
+        session.observe_until(REQUEST_PERIOD, &mut |frame| {
             let answer = frame.exactly::<8>().is_some_and(|bytes| bytes[0] == NOBODY_YET);
             heard = match parse_state_message(frame) {
                 Some((node, NmtState::Initialisation)) => Some(Heard::BootUp(node)),
@@ -142,7 +142,7 @@ fn catch_anybody(
             Some(Heard::BootUp(node)) => {
                 session.talk_to(node);
                 if let Some(running) = session.device_type()? {
-                    tell(Event::Found(running));
+                    on_event(Event::Found(running));
                     if running.is_bootloader() {
                         return Ok(Caught { node: Some(node), running: Some(running) });
                     }

@@ -13,8 +13,8 @@ use seal::access::event;
 use serde::Serialize;
 use shared_abi::block_file::ProgramVersion;
 
-use crate::device::access::{events, told_challenge};
-use crate::device::error::{told, Error};
+use crate::device::access::{events, reported_challenge};
+use crate::device::error::{reported, Error};
 use crate::device::{DeviceType, Session};
 use crate::file::sealed::show::digits;
 use crate::file::sealed::SealedFile;
@@ -117,13 +117,12 @@ impl Comparison {
 /// # Errors
 /// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
 pub fn compare_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<Comparison, Error> {
-    const RUNNING: u32 = ProgramState::Running as u32;
     let head = file.head();
     let program = head.program();
     let running = session.find()?;
     let mut comparison = Comparison { running, runs: false, differences: Vec::new(), untold: Vec::new() };
     let mut number = |comparison: &mut Comparison, at: Address| -> Result<Option<u32>, Error> {
-        let value = told(session.read_number(at))?;
+        let value = reported(session.read_number(at))?;
         if value.is_none() {
             comparison.untold.push(at);
         }
@@ -148,7 +147,8 @@ pub fn compare_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<Co
             }
         }
     }
-    comparison.runs = number(&mut comparison, Address::new(PROGRAM_CONTROL, program))? == Some(RUNNING);
+    comparison.runs = number(&mut comparison, Address::new(PROGRAM_CONTROL, program))?
+        == Some(ProgramState::Running as u32);
     match number(&mut comparison, Address::new(PROGRAM_ID, program))? {
         Some(0) if head.crc() != 0 => comparison.differs(Part::Crc, hexadecimal(head.crc()), "no program"),
         Some(device) => comparison.compare(Part::Crc, head.crc(), device, hexadecimal),
@@ -169,7 +169,7 @@ fn compare_access(
     file: &SealedFile,
     comparison: &mut Comparison,
 ) -> Result<(), Error> {
-    match told_challenge(session)? {
+    match reported_challenge(session)? {
         Some(challenge) => {
             let only_for = file.head().unique_id();
             if only_for != [0; 12] {
@@ -197,11 +197,8 @@ fn compare_events(
 ) -> Result<(), Error> {
     let head = file.head();
     let installed = event::INSTALLED | u32::from(head.program());
-    let last = match events(session) {
-        Ok(events) => events.into_iter().find(|event| event.what == installed),
-        Err(Error::Refused { .. }) => None,
-        Err(error) => return Err(error),
-    };
+    let last =
+        reported(events(session))?.unwrap_or_default().into_iter().find(|event| event.what == installed);
     match last {
         Some(last) => {
             comparison

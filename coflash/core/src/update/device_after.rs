@@ -3,14 +3,14 @@
 use std::fmt;
 
 use canopen::program::ProgramState;
-use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 
 use crate::advice::Advice;
 use crate::device::DeviceType;
 
 /// The contents of a device after a failed procedure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum DeviceState {
     /// Nothing was changed.
     Untouched,
@@ -45,12 +45,6 @@ impl DeviceState {
     }
 }
 
-impl Serialize for DeviceState {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.name())
-    }
-}
-
 impl fmt::Display for DeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -68,12 +62,13 @@ impl fmt::Display for DeviceState {
 }
 
 /// The state of a device after a failed update. `Display` has the text for people.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct DeviceAfterUpdate {
     /// The device's contents: from its own answers if it answered, otherwise the last known state.
     pub state: DeviceState,
     /// The device's answer after the failure.
+    #[serde(rename = "seen", serialize_with = "given")]
     pub answer: DeviceAnswer,
 }
 
@@ -85,14 +80,15 @@ pub enum DeviceAnswer {
     /// It does not answer.
     Silent,
     /// It has answered.
-    Seen(Seen),
+    Given(Answers),
 }
 
 /// The answers of a device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct Seen {
+pub struct Answers {
     /// 1000h.
+    #[serde(flatten)]
     pub running: DeviceType,
     /// 1F51h of the program, if the object exists.
     pub control: Option<u32>,
@@ -104,42 +100,26 @@ impl DeviceAfterUpdate {
     /// The advice at the end of its text, if there is any.
     #[must_use]
     pub fn advice(&self) -> Option<Advice> {
-        let DeviceAnswer::Seen(seen) = self.answer else { return None };
-        let waits = self.state == DeviceState::Called && seen.running.is_bootloader() && !seen.empty();
+        let DeviceAnswer::Given(answers) = self.answer else { return None };
+        let waits = self.state == DeviceState::Called && answers.running.is_bootloader() && !answers.empty();
         waits.then_some(Advice::StartIt)
     }
 }
 
-impl Seen {
+impl Answers {
     /// Whether the device reports that it has no program.
     pub(super) fn empty(&self) -> bool {
         self.control == Some(ProgramState::Absent as u32) || self.crc == Some(0)
     }
 }
 
-/// `state`, and the device's answers as `seen`, if there are any.
-impl Serialize for DeviceAfterUpdate {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let seen = match &self.answer {
-            DeviceAnswer::Seen(seen) => Some(seen),
-            DeviceAnswer::NotAsked | DeviceAnswer::Silent => None,
-        };
-        let mut fields = serializer.serialize_struct("DeviceAfterUpdate", 2)?;
-        fields.serialize_field("state", &self.state)?;
-        fields.serialize_field("seen", &seen)?;
-        fields.end()
-    }
-}
-
-impl Serialize for Seen {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut fields = serializer.serialize_struct("Seen", 4)?;
-        fields.serialize_field("device_type", &self.running.0)?;
-        fields.serialize_field("bootloader", &self.running.is_bootloader())?;
-        fields.serialize_field("control", &self.control)?;
-        fields.serialize_field("crc", &self.crc)?;
-        fields.end()
-    }
+/// The device's answers, if there are any.
+fn given<S: Serializer>(answer: &DeviceAnswer, serializer: S) -> Result<S::Ok, S::Error> {
+    let answers = match answer {
+        DeviceAnswer::Given(answers) => Some(answers),
+        DeviceAnswer::NotAsked | DeviceAnswer::Silent => None,
+    };
+    answers.serialize(serializer)
 }
 
 impl fmt::Display for DeviceAfterUpdate {
@@ -150,11 +130,11 @@ impl fmt::Display for DeviceAfterUpdate {
             }
             DeviceAnswer::NotAsked => write!(f, "it cannot be asked any more; last known: {}", self.state),
             DeviceAnswer::Silent => write!(f, "it does not answer; last known: {}", self.state),
-            DeviceAnswer::Seen(seen) => {
-                let what = if seen.running.is_bootloader() { "bootloader" } else { "application" };
+            DeviceAnswer::Given(answers) => {
+                let what = if answers.running.is_bootloader() { "bootloader" } else { "application" };
                 write!(f, "its {what} is running; {}", self.state)?;
-                match seen.crc {
-                    Some(crc) if !seen.empty() && self.state != DeviceState::Erased => {
+                match answers.crc {
+                    Some(crc) if !answers.empty() && self.state != DeviceState::Erased => {
                         write!(f, " (CRC {crc:08X}h)")?;
                     }
                     _ => {}

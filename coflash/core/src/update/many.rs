@@ -74,14 +74,19 @@ const GROUP_ANSWERS: u16 = 0x680;
 
 /// Updates all devices; if one fails, the others continue. A device that fails in a group is
 /// updated once more, without the others. Bootloaders are renewed after that, one after the other; if the
-/// first one fails, the others are not touched. `tell` gets the events of each job, on separate threads.
+/// first one fails, the others are not touched. `on_event` gets the events of each job, on separate threads.
 /// The results are in the order of the jobs.
 pub fn flash_many(
     adapter: &mut dyn Adapter,
     jobs: &[Job],
     options: &ManyOptions,
-    tell: &(dyn Fn(usize, Event) + Sync),
+    on_event: &(dyn Fn(usize, Event) + Sync),
 ) -> Vec<Result<Report, Failed>> {
+    // A device alone can be followed to another node-ID, which lifts need.
+    if let [job] = jobs {
+        let mut session = Session::new(adapter, job.node, options.timing);
+        return vec![update(&mut session, job, &job.options, options, &mut |event| on_event(0, event))];
+    }
     let numbered = || jobs.iter().enumerate();
     let programs: Vec<(usize, &Job)> = numbered().filter(|(_, job)| !job.file.is_bootloader()).collect();
     let channels = if options.together { channels(&programs) } else { vec![None; programs.len()] };
@@ -92,20 +97,20 @@ pub fn flash_many(
         .collect();
     let mut results: BTreeMap<usize, Result<Report, Failed>> = BTreeMap::new();
     let mut again: Vec<Planned<'_>> = Vec::new();
-    let ends = flash_each(adapter, &all, options, tell);
+    let ends = flash_each(adapter, &all, options, on_event);
     for (plan, end) in all.into_iter().zip(ends) {
         if end.is_for_another {
             again.push(Planned { channel: None, ..plan });
         }
         results.insert(plan.number, end.result);
     }
-    let ends = flash_each(adapter, &again, options, tell);
+    let ends = flash_each(adapter, &again, options, on_event);
     results.extend(again.iter().map(|plan| plan.number).zip(ends.into_iter().map(|end| end.result)));
     let mut fate = Fate::default();
     for (number, job) in numbered().filter(|(_, job)| job.file.is_bootloader()) {
         let plan = [Planned { number, job, channel: None }];
         let alone = ManyOptions { at_once: 1, ..options.clone() };
-        let renew = || flash_each(adapter, &plan, &alone, tell).into_iter().map(|end| end.result).next();
+        let renew = || flash_each(adapter, &plan, &alone, on_event).into_iter().map(|end| end.result).next();
         results.extend(fate.of(job, renew).map(|result| (number, result)));
     }
     results.into_values().collect()
@@ -169,7 +174,7 @@ fn flash_each(
     adapter: &mut dyn Adapter,
     jobs: &[Planned<'_>],
     options: &ManyOptions,
-    tell: &(dyn Fn(usize, Event) + Sync),
+    on_event: &(dyn Fn(usize, Event) + Sync),
 ) -> Vec<End> {
     let at_once = options.at_once.clamp(1, jobs.len().max(1));
     // Without a group, a request may have to wait for the segments of another transfer.
@@ -188,7 +193,7 @@ fn flash_each(
                 Event::Done(_) => done = Some(event),
                 event => {
                     was_in_group |= matches!(event, Event::Note(Note::Together { .. }));
-                    tell(number, event);
+                    on_event(number, event);
                 }
             });
             let is_over = |error: &Error| {
@@ -199,9 +204,9 @@ fn flash_each(
             match (&result, done) {
                 // This is not the end.
                 (Err(failed), _) if is_for_another => {
-                    tell(number, Warning::Apart { why: failed.error.to_string() }.into());
+                    on_event(number, Warning::Apart { why: failed.error.to_string() }.into());
                 }
-                (_, Some(done)) => tell(number, done),
+                (_, Some(done)) => on_event(number, done),
                 _ => {}
             }
             End { result, is_for_another }
@@ -220,11 +225,11 @@ pub fn flash_in_turn(
     gateway: &mut dyn Gateway,
     jobs: &[Job],
     options: &ManyOptions,
-    tell: &dyn Fn(usize, Event),
+    on_event: &dyn Fn(usize, Event),
 ) -> Vec<Result<Report, Failed>> {
     let mut one = |(number, job): (usize, &Job)| {
         let mut session = Session::through(&mut *gateway, job.node, options.timing);
-        update(&mut session, job, &job.options, options, &mut |event| tell(number, event))
+        update(&mut session, job, &job.options, options, &mut |event| on_event(number, event))
     };
     let mut fate = Fate::default();
     let each = |(number, job): (usize, &Job)| {
@@ -238,19 +243,19 @@ pub fn flash_in_turn(
 }
 
 /// Updates one of the devices.
-pub(crate) fn update(
+fn update(
     session: &mut Session<'_>,
     job: &Job,
     one: &FlashOptions,
     all: &ManyOptions,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<Report, Failed> {
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
     let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
     let result = flash(session, &job.file, one, &mut |event| {
         left = event.left().unwrap_or(left);
-        tell(event);
+        on_event(event);
     });
     result.map_err(|error| Failed { error, left })
 }

@@ -5,16 +5,15 @@
 //! checks that are possible before the device is changed are made there and in `admission`.
 
 use super::admission::admit;
-use super::aftermath::look;
+use super::aftermath::state_after;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
-use super::entry::enter;
 use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
 use super::payload::Payload;
-use super::reach::{find, reach};
-use super::renewal::Renewal;
-use super::running::{give_back, telling_silence, RunningUpdate};
+use super::reach::{enter, find, reach};
+use super::report::Renewal;
+use super::running::{give_back, reporting_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
 use crate::device::{Dialect, Error, Session};
@@ -26,7 +25,7 @@ use crate::device::{Dialect, Error, Session};
 /// the dialect of the device has these steps. A bootloader runs on trial, is confirmed and installed; the
 /// program stays, and is started again if it ran before.
 ///
-/// `tell` gets the events; the last event is always [`Event::Done`].
+/// `on_event` gets the events; the last event is always [`Event::Done`].
 ///
 /// An update that was interrupted at any point can be started again at once.
 ///
@@ -37,20 +36,20 @@ pub fn flash(
     session: &mut Session<'_>,
     file: impl Into<Payload>,
     options: &FlashOptions,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
     let file = &file.into();
-    let (result, node, transfers) = telling_silence(session, tell, |session, tell| {
-        let mut update = RunningUpdate::new(session.node(), *options, tell);
+    let (result, node, transfers) = reporting_silence(session, on_event, |session, on_event| {
+        let mut update = RunningUpdate::new(session.node(), *options, on_event);
         let result = procedure(session, file, &mut update);
         let left = match &result {
             Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
-            Err(error) => look(session, error, &update, options.program, file.crcs()),
+            Err(error) => state_after(session, error, &update, options.program, file.crcs()),
         };
         if let Some(taken) = update.mastership.take() {
-            give_back(session, taken, &mut |event| update.tell(event));
+            give_back(session, taken, &mut |event| update.report(event));
         }
-        update.tell(Event::Done(Box::new(Done::new(left, &result))));
+        update.report(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())
     });
     // The session may have followed the device to another node-ID.
@@ -72,21 +71,21 @@ fn procedure(
         enter(session, file, found, admission, update)
     })?;
     let (dialect, options) = (update.dialect, update.options);
-    let its = dialect::procedure(file, dialect);
+    let procedure = dialect::procedure(file, dialect);
     if dialect != Dialect::Block {
         session.leave_group();
     }
-    let downloaded = its.download(session, file, update)?;
+    let downloaded = procedure.download(session, file, update)?;
     let Downloaded { repeats, took: transfer, released, renewal } = downloaded;
     let running = match renewal {
         Some(renewal) => renewal.running,
         None if options.start => {
             let time = watch::time(session, dialect, &options)?;
-            update.tell(Phase::Starting.into());
+            update.report(Phase::Starting.into());
             let starts = session.now();
-            let running = its.start(session, update.original, options.program)?;
+            let running = procedure.start(session, update.original, options.program)?;
             watch::watch(session, starts, time)?;
-            update.tell(Phase::Started(running).into());
+            update.report(Phase::Started(running).into());
             Some(running)
         }
         None => None,
@@ -94,7 +93,7 @@ fn procedure(
     // 1F56h of a program is not that of a new bootloader.
     if options.verify && renewal.is_none() {
         let crc = compare_crc(session, options.program, file.crcs())?;
-        update.tell(Phase::VerifiedAgain { crc }.into());
+        update.report(Phase::VerifiedAgain { crc }.into());
     }
     let took = session.now().saturating_sub(began);
     let (program_size, program_crc) = (file.size(), file.crc());

@@ -1,7 +1,10 @@
-//! Step 2: the search for a device.
+//! Steps 2 and 3: the search for a device, and its way into the bootloader.
 
-use super::catch::knock;
+use super::admission::Admission;
+use super::catch::search;
+use super::dialect;
 use super::event::{Event, Note, Phase};
+use super::payload::Payload;
 use super::running::RunningUpdate;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, DeviceType, Dialect, Error, Session};
@@ -34,17 +37,17 @@ pub(super) fn reach<R>(
         }
         return attempt(session, update);
     }
-    update.tell_once(true);
+    update.report_once(true);
     loop {
-        knock(session, None, &mut |event| update.tell(event))?;
+        search(session, None, &mut |event| update.report(event))?;
         match attempt(session, update) {
             Err(error @ (Error::NoAnswer { .. } | Error::NoBootloader { .. })) => {
-                update.tell(Phase::Searching { reason: error.to_string() }.into());
+                update.report(Phase::Searching { reason: error.to_string() }.into());
                 let pause = session.timing().poll_most;
                 session.wait(pause)?;
             }
             result => {
-                update.tell_once(false);
+                update.report_once(false);
                 return result;
             }
         }
@@ -57,14 +60,63 @@ pub(super) fn reach<R>(
 /// [`Error::NoAnswer`], [`Error::WrongTarget`], and the errors of a [read](Session::read).
 pub(super) fn find(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> Result<Found, Error> {
     let running = session.find()?;
-    update.tell(Event::Found(running));
+    update.report(Event::Found(running));
     if let Some(target) = update.options.check_target {
         check_target(session, target)?;
-        update.tell(Note::TargetRight(target).into());
+        update.report(Note::TargetRight(target).into());
     }
     let dialect = match update.options.dialect {
         Some(dialect) => dialect,
         None => recognise(session, running, CALL_BACK)?,
     };
     Ok(Found { running, dialect })
+}
+
+/// Brings the device into its bootloader, which answers what the application did not know.
+///
+/// # Errors
+/// [`Error::NotAlone`], [`Error::NoBootloader`], and those of the [admission](Admission::ask). The program
+/// that was called back is started again, if the device still answers.
+pub(super) fn enter(
+    session: &mut Session<'_>,
+    file: &Payload,
+    found: Found,
+    mut admission: Admission<'_>,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(), Error> {
+    let alone = update.options.alone;
+    match (alone, update.options.wait) {
+        (false, _) => {}
+        (true, false) => session.still_alone()?,
+        (true, true) => session.ensure_alone()?,
+    }
+    let before = session.now();
+    update.dialect = dialect::procedure(file, found.dialect).enter(session, found, update)?;
+    let is_ready = (|| {
+        if !found.running.is_bootloader() {
+            admission.ask(session, update.dialect)?;
+        }
+        match update.called {
+            _ if !alone => Ok(()),
+            Some(_) => session.await_peace(before),
+            None => session.still_alone(),
+        }
+    })();
+    if let (Err(error), Some(program)) = (&is_ready, update.called) {
+        let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
+        // The device belongs to the tool that commands it.
+        if !is_lost && !session.is_commanded_since(before) {
+            start_again(session, program, update);
+        }
+    }
+    is_ready
+}
+
+/// Starts the program again that was called back for an update which does not take place. The reason
+/// for that stays the result, whether the program starts or not.
+fn start_again(session: &mut Session<'_>, program: u8, update: &mut RunningUpdate<'_>) {
+    update.report(Phase::StartingAgain.into());
+    if let Ok(running) = dialect::of(update.dialect).start(session, update.original, program) {
+        update.report(Phase::Started(running).into());
+    }
 }

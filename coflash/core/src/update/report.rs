@@ -1,11 +1,11 @@
-//! The results of an update.
+//! The results of an update, and of the renewal of a bootloader.
 
 use std::fmt;
 use std::time::Duration;
 
 use serde::{Serialize, Serializer};
+use shared_abi::ram_image::Version;
 
-use super::renewal::Renewal;
 use crate::device::{DeviceType, Dialect, Transfers};
 use crate::json;
 
@@ -32,7 +32,7 @@ pub struct Report {
     #[serde(rename = "transfer")]
     pub transfers: Transfers,
     /// The device type of what runs now, if the program was started.
-    #[serde(serialize_with = "running")]
+    #[serde(serialize_with = "device_type")]
     pub running: Option<DeviceType>,
     /// Whether the program is released for autostart (83h); `None` in a dialect without a release.
     pub released: Option<bool>,
@@ -44,7 +44,7 @@ pub struct Report {
 }
 
 /// Only the device type: it is known that an application runs.
-fn running<S: Serializer>(running: &Option<DeviceType>, serializer: S) -> Result<S::Ok, S::Error> {
+fn device_type<S: Serializer>(running: &Option<DeviceType>, serializer: S) -> Result<S::Ok, S::Error> {
     running.map(|running| running.0).serialize(serializer)
 }
 
@@ -59,5 +59,46 @@ impl fmt::Display for Report {
             1 => f.write_str(", 1 block sent again"),
             blocks => write!(f, ", {blocks} blocks sent again"),
         }
+    }
+}
+
+/// The results of a renewal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Renewal {
+    /// The program number of the bootloader.
+    pub number: u8,
+    /// The version that ran before.
+    #[serde(serialize_with = "number_of")]
+    pub from: Version,
+    /// The version that runs now.
+    #[serde(serialize_with = "number_of")]
+    pub to: Version,
+    /// Whether the device had this bootloader already: nothing was changed.
+    pub unchanged: bool,
+    /// How many times it had to be sent again.
+    pub repeats: u32,
+    /// The time for the download.
+    #[serde(rename = "transfer_seconds", serialize_with = "json::seconds")]
+    pub transfer: Duration,
+    /// The total time, on the bus's clock.
+    #[serde(rename = "seconds", serialize_with = "json::seconds")]
+    pub took: Duration,
+    /// The device type of the program, if one ran before and was started again.
+    #[serde(serialize_with = "device_type")]
+    pub running: Option<DeviceType>,
+}
+
+fn number_of<S: Serializer>(version: &Version, serializer: S) -> Result<S::Ok, S::Error> {
+    version.0.serialize(serializer)
+}
+
+impl fmt::Display for Renewal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { from, to, .. } = self;
+        if self.unchanged {
+            return write!(f, "nothing to do: the device has this bootloader (version {to})");
+        }
+        write!(f, "done in {:.1} s: bootloader {from} -> {to}, installed", self.took.as_secs_f64())
     }
 }

@@ -13,25 +13,25 @@ use crate::device::session::Silence;
 use crate::device::{Dialect, Session};
 
 /// Carries out `work` in a session that reports silence of the node as an event.
-pub(super) fn telling_silence<R>(
+pub(super) fn reporting_silence<R>(
     session: &mut Session<'_>,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
     work: impl FnOnce(&mut Session<'_>, &mut dyn FnMut(Event)) -> R,
 ) -> R {
-    let tell = RefCell::new(tell);
+    let on_event = RefCell::new(on_event);
     let silence = |silence: Silence| {
         let Silence { doing, silent, limit, .. } = silence;
-        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
+        (on_event.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
     };
-    let mut tell = |event| (tell.borrow_mut())(event);
+    let mut on_event = |event| (on_event.borrow_mut())(event);
     let (node, timing) = (session.node(), *session.timing());
-    work(&mut session.with(node, timing).tell_silence(&silence), &mut tell)
+    work(&mut session.with(node, timing).report_silence(&silence), &mut on_event)
 }
 
 /// Gives the NMT mastership back. The result of the update remains, even if this fails.
-pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut dyn FnMut(Event)) {
+pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, on_event: &mut dyn FnMut(Event)) {
     if let Ok(master) = flying_master::give_back(session, taken) {
-        tell(match master {
+        on_event(match master {
             Some(master) => Note::MasterBack { node: master.node }.into(),
             None => Warning::MasterMissing.into(),
         });
@@ -53,7 +53,7 @@ pub(super) struct RunningUpdate<'t> {
     /// Whether any action may have changed the device.
     pub(super) touched: bool,
     /// The state before the erase.
-    pub(super) resting: DeviceState,
+    pub(super) state_before: DeviceState,
     /// The value of 1F56h before the erase, if it was read.
     pub(super) before: Option<u32>,
     /// Whether the device has postponed the erase, and has acknowledged no data since then.
@@ -66,14 +66,14 @@ pub(super) struct RunningUpdate<'t> {
     together: usize,
     /// Whether it was reported that somebody else uses a COB-ID of the group.
     disturbed: bool,
-    tell: &'t mut dyn FnMut(Event),
+    on_event: &'t mut dyn FnMut(Event),
     /// The events that were reported, if each event is reported only once.
-    told: Option<Vec<Event>>,
+    reported: Option<Vec<Event>>,
 }
 
 impl<'t> RunningUpdate<'t> {
     /// An update of this node that has not done anything yet.
-    pub(super) fn new(original: NodeId, options: FlashOptions, tell: &'t mut dyn FnMut(Event)) -> Self {
+    pub(super) fn new(original: NodeId, options: FlashOptions, on_event: &'t mut dyn FnMut(Event)) -> Self {
         Self {
             options,
             original,
@@ -81,15 +81,15 @@ impl<'t> RunningUpdate<'t> {
             state: DeviceState::Untouched,
             called: None,
             touched: false,
-            resting: DeviceState::Untouched,
+            state_before: DeviceState::Untouched,
             before: None,
             postponed: false,
             wrote: false,
             mastership: None,
             together: 0,
             disturbed: false,
-            tell,
-            told: None,
+            on_event,
+            reported: None,
         }
     }
 
@@ -97,7 +97,7 @@ impl<'t> RunningUpdate<'t> {
     pub(super) fn erases(&mut self, before: Option<u32>) {
         self.touched = true;
         if self.state != DeviceState::Erased {
-            self.resting = std::mem::replace(&mut self.state, DeviceState::Erased);
+            self.state_before = std::mem::replace(&mut self.state, DeviceState::Erased);
             self.before = before;
         }
     }
@@ -105,7 +105,7 @@ impl<'t> RunningUpdate<'t> {
     /// Records that the device has refused the erase.
     pub(super) fn erases_not(&mut self) {
         if self.state == DeviceState::Erased && !self.wrote {
-            self.state = self.resting;
+            self.state = self.state_before;
         }
     }
 
@@ -118,7 +118,7 @@ impl<'t> RunningUpdate<'t> {
     }
 
     /// Reports an event.
-    pub(super) fn tell(&mut self, event: Event) {
+    pub(super) fn report(&mut self, event: Event) {
         match &event {
             Event::Phase(Phase::Erased { took }) => self.postponed = *took < PUT_OFF && !self.wrote,
             Event::Note(Note::Together { devices }) if self.together == *devices => return,
@@ -126,17 +126,17 @@ impl<'t> RunningUpdate<'t> {
             Event::Warning(Warning::GroupDisturbed) if std::mem::replace(&mut self.disturbed, true) => return,
             _ => {}
         }
-        if let Some(told) = &mut self.told {
-            if told.contains(&event) {
+        if let Some(reported) = &mut self.reported {
+            if reported.contains(&event) {
                 return;
             }
-            told.push(event.clone());
+            reported.push(event.clone());
         }
-        (self.tell)(event);
+        (self.on_event)(event);
     }
 
     /// Sets whether repeated events are reported only once.
-    pub(super) fn tell_once(&mut self, once: bool) {
-        self.told = once.then(Vec::new);
+    pub(super) fn report_once(&mut self, once: bool) {
+        self.reported = once.then(Vec::new);
     }
 }

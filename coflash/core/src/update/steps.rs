@@ -8,7 +8,7 @@ use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
 use super::phase::{Note, PUT_OFF};
-use crate::device::error::{absent, told, Error, IdentityPart};
+use crate::device::error::{absent, reported, Error, IdentityPart};
 use crate::device::read_state::{autostart_words, program_start, state_after_failure};
 use crate::device::{DeviceType, Doing, Session, Timing};
 use crate::file::Target;
@@ -40,13 +40,13 @@ pub(super) fn compare_target(
     read: impl Fn(&mut Session<'_>, Address) -> Result<Option<u32>, Error>,
 ) -> Result<(), Error> {
     let Target { vendor_id, product_code } = target;
-    let mut told = |sub| read(session, Address::new(program::IDENTITY, sub));
+    let mut reported = |sub| read(session, Address::new(program::IDENTITY, sub));
     let mut device = (vendor_id, product_code);
     // What the file leaves open is read only if the rest differs: 0 and 0 are no identity.
     for is_open in [false, true] {
         for (sub, file, value) in [(1, vendor_id, &mut device.0), (2, product_code, &mut device.1)] {
             if (file == 0) == is_open {
-                *value = told(sub)?.unwrap_or(file);
+                *value = reported(sub)?.unwrap_or(file);
             }
         }
         if device == (vendor_id, product_code) {
@@ -68,15 +68,15 @@ pub(super) fn compare_target(
 /// # Errors
 /// [`Error::NoAnswer`] if nothing answers, [`Error::NoBootloader`] if the application does not
 /// return.
-pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+pub fn enter_bootloader(session: &mut Session<'_>, on_event: &mut dyn FnMut(Event)) -> Result<(), Error> {
     let running = session.find()?;
-    tell(Event::Found(running));
+    on_event(Event::Found(running));
     if running.is_bootloader() {
         return Ok(());
     }
-    tell(Phase::CallingBack.into());
+    on_event(Phase::CallingBack.into());
     call_back(session)?;
-    tell(Phase::InBootloader.into());
+    on_event(Phase::InBootloader.into());
     Ok(())
 }
 
@@ -121,9 +121,10 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
 /// The program that runs, as 1F51h reports it: `number`, or the one of [`CALL_BACK`]; `None` if
 /// neither runs, or the device does not say.
 pub(super) fn running_program(session: &mut Session<'_>, number: u8) -> Result<Option<u8>, Error> {
-    const RUNNING: u32 = ProgramState::Running as u32;
     for number in [number, CALL_BACK] {
-        if told(session.read_number(Address::new(program::PROGRAM_CONTROL, number)))? == Some(RUNNING) {
+        if reported(session.read_number(Address::new(program::PROGRAM_CONTROL, number)))?
+            == Some(ProgramState::Running as u32)
+        {
             return Ok(Some(number));
         }
     }
@@ -155,11 +156,11 @@ pub(super) fn settle(
 ///
 /// # Errors
 /// [`Error::Failed`] with the error in 1F57h, [`Error::Busy`], [`Error::NoAnswer`].
-pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
-    tell(Phase::Erasing.into());
+pub fn erase(session: &mut Session<'_>, number: u8, on_event: &mut dyn FnMut(Event)) -> Result<(), Error> {
+    on_event(Phase::Erasing.into());
     let began = session.now();
     execute(session, number, ProgramControl::Clear)?;
-    tell(Phase::Erased { took: session.now().saturating_sub(began) }.into());
+    on_event(Phase::Erased { took: session.now().saturating_sub(began) }.into());
     Ok(())
 }
 
@@ -167,19 +168,19 @@ pub fn erase(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event))
 pub(super) fn clear_and_wait(
     session: &mut Session<'_>,
     number: u8,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     match session.status(number) {
         Err(Error::Refused { code, .. }) if absent(code) => {}
         Err(error @ Error::Refused { .. }) => return Err(error),
-        _ => return erase(session, number, tell),
+        _ => return erase(session, number, on_event),
     }
-    tell(Phase::Erasing.into());
+    on_event(Phase::Erasing.into());
     let began = session.now();
     let node = session.node();
     let patient = session.timing().erasing();
     session.with(node, patient).command(number, ProgramControl::Clear)?;
-    tell(Phase::Erased { took: session.now().saturating_sub(began) }.into());
+    on_event(Phase::Erased { took: session.now().saturating_sub(began) }.into());
     Ok(())
 }
 
@@ -202,11 +203,11 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
 ///
 /// # Errors
 /// As [`erase`].
-pub fn release(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+pub fn release(session: &mut Session<'_>, number: u8, on_event: &mut dyn FnMut(Event)) -> Result<(), Error> {
     execute(session, number, ProgramControl::SetSignature)?;
-    tell(Phase::Released.into());
+    on_event(Phase::Released.into());
     if let Some(says) = program_start(session)?.and_then(|start| autostart_words(start, number)) {
-        tell(Note::Autostart { number, says }.into());
+        on_event(Note::Autostart { number, says }.into());
     }
     Ok(())
 }
@@ -281,10 +282,10 @@ pub fn verify(
     session: &mut Session<'_>,
     number: u8,
     crcs: [u32; 2],
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     let crc = compare_crc(session, number, crcs)?;
-    tell(Phase::Verified { crc }.into());
+    on_event(Phase::Verified { crc }.into());
     Ok(())
 }
 
@@ -317,27 +318,63 @@ pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crcs: [u32; 2])
 /// # Errors
 /// [`Error::StartFailed`].
 pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
-    let node = session.node();
-    let failed = |session: &mut Session<'_>, running| {
-        let status = session.status(number).ok();
-        Error::StartFailed { node, running, status, state: state_after_failure(session), elsewhere: None }
-    };
     let began = session.now();
     match session.command(number, ProgramControl::Start) {
         // A device that resets at once may not send its answer.
-        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {
+            await_program(session, number, began)
+        }
         Err(Error::Refused { .. }) => {
             let running = session.device_type()?;
-            return Err(failed(session, running));
+            Err(start_failed(session, number, running, began))
         }
-        Err(error) => return Err(error),
+        Err(error) => Err(error),
     }
+}
+
+/// Step 15 in the dialects without START: "reset program" (2 of 1F51h), or NMT reset node if the device does
+/// not have this object.
+pub(super) fn reset_program(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    let at = Address::new(program::PROGRAM_CONTROL, number);
+    match session.write(at, &[ProgramControl::ResetStat as u8], Doing::Restart, &mut |_| {}) {
+        Err(Error::Refused { code, .. }) if absent(code) => session.reset_node(),
+        // A device that resets at once may not send its answer.
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Waits for the program that was started at `began`; returns its device type.
+///
+/// # Errors
+/// [`Error::StartFailed`].
+pub(super) fn await_program(
+    session: &mut Session<'_>,
+    number: u8,
+    began: Duration,
+) -> Result<DeviceType, Error> {
     match settle(session, |running| !running.is_bootloader())? {
         Some(running) if !running.is_bootloader() => Ok(running),
-        Some(running) => Err(failed(session, Some(running))),
+        running => Err(start_failed(session, number, running, began)),
+    }
+}
+
+/// The error of a program that does not start; a device that answers is asked for the reason.
+fn start_failed(
+    session: &mut Session<'_>,
+    number: u8,
+    running: Option<DeviceType>,
+    began: Duration,
+) -> Error {
+    let node = session.node();
+    match running {
+        Some(_) => {
+            let (status, state) = (session.status(number).ok(), state_after_failure(session));
+            Error::StartFailed { node, running, status, state, elsewhere: None }
+        }
         None => {
             let elsewhere = session.booted_elsewhere_since(began);
-            Err(Error::StartFailed { node, running: None, status: None, state: None, elsewhere })
+            Error::StartFailed { node, running, status: None, state: None, elsewhere }
         }
     }
 }

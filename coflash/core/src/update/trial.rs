@@ -13,7 +13,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
     let options = update.options;
     let bootloader = identity(session)?;
     let time = watch::time(session, Dialect::Block, &options)?;
-    update.tell(Phase::TrialStarting.into());
+    update.report(Phase::TrialStarting.into());
     let began = session.now();
     let running = start(session, options.program).map_err(failed)?;
     watch::watch(session, began, time).map_err(failed)?;
@@ -25,7 +25,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
     let back = call_back(session).map_err(failed);
     right?;
     back?;
-    update.tell(Phase::TrialPassed(running).into());
+    update.report(Phase::TrialPassed(running).into());
     Ok(())
 }
 
@@ -51,9 +51,9 @@ fn failed(error: Error) -> Error {
 fn same_identity(session: &mut Session<'_>, bootloader: Identity) -> Result<(), Error> {
     let application = identity(session)?;
     for (sub, optional) in [(1, false), (2, true), (4, true)] {
-        let told =
+        let reported =
             |identity: Identity| identity[usize::from(sub) - 1].filter(|number| !optional || *number != 0);
-        let (expected, found) = (told(bootloader), told(application));
+        let (expected, found) = (reported(bootloader), reported(application));
         let silent = found.is_none() && optional;
         if expected.is_some() && found != expected && !silent {
             let node = session.node();

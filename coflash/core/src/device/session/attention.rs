@@ -18,7 +18,7 @@ const PEACE: Duration = Duration::from_secs(3);
 impl<'a> Session<'a> {
     /// Reports silence to `hook` while it lasts, once for each silence.
     #[must_use]
-    pub fn tell_silence(mut self, hook: &'a dyn Fn(Silence)) -> Self {
+    pub fn report_silence(mut self, hook: &'a dyn Fn(Silence)) -> Self {
         self.on_silence = Some(hook);
         self
     }
@@ -38,7 +38,7 @@ impl<'a> Session<'a> {
     pub(crate) fn note_silence(&self, began: Duration, limit: Duration, doing: Doing) {
         let Some(hook) = self.on_silence else { return };
         let silent = self.silent_since(began);
-        if silent < SILENCE || silent >= limit || std::mem::replace(&mut self.watch().told, true) {
+        if silent < SILENCE || silent >= limit || std::mem::replace(&mut self.watch().reported, true) {
             return;
         }
         hook(Silence { node: self.node, doing, silent, limit });

@@ -6,7 +6,7 @@ use canopen::nmt::{parse_boot_up, NmtCommand};
 use canopen::{CobId, Frame, NodeId};
 
 use super::watch::Watch;
-use super::{Session, Way};
+use super::{Access, Session};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
 
@@ -107,11 +107,11 @@ impl Session<'_> {
     /// [`Error::Adapter`].
     pub fn reset_node(&mut self) -> Result<(), Error> {
         let node = self.node;
-        match &mut self.way {
-            Way::Bus(adapter) => {
+        match &mut self.access {
+            Access::Bus(adapter) => {
                 Ok(adapter.send(&Frame::of(CobId::NMT, &[NmtCommand::ResetNode as u8, node.get()]))?)
             }
-            Way::Gateway(gateway) => {
+            Access::Gateway(gateway) => {
                 gateway.reset_node(node).map_err(|error| of_gateway(error, node, Doing::Restart))
             }
         }
@@ -123,9 +123,9 @@ impl Session<'_> {
     /// # Errors
     /// [`Error::Adapter`].
     pub fn send(&mut self, frame: &Frame) -> Result<(), Error> {
-        match &mut self.way {
-            Way::Bus(adapter) => adapter.send(frame)?,
-            Way::Gateway(_) => return Ok(()),
+        match &mut self.access {
+            Access::Bus(adapter) => adapter.send(frame)?,
+            Access::Gateway(_) => return Ok(()),
         }
         self.watch().sent(frame, self.node);
         Ok(())
@@ -134,9 +134,9 @@ impl Session<'_> {
     /// Returns the next frame from the bus. Frames that need an answer of
     /// [`answer_by`](Self::answer_by) are answered here. A gateway reports only boot-up messages.
     pub(super) fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, Error> {
-        let adapter = match &mut self.way {
-            Way::Bus(adapter) => adapter,
-            Way::Gateway(gateway) => {
+        let adapter = match &mut self.access {
+            Access::Bus(adapter) => adapter,
+            Access::Gateway(gateway) => {
                 let booted = gateway.wait(timeout);
                 let booted = booted.map_err(|error| of_gateway(error, self.node, Doing::Restart))?;
                 if let Some(booted) = booted {

@@ -32,7 +32,7 @@ pub use self::watch::{Silence, SILENCE};
 pub const UPLOAD_MAX: usize = 64 * 1024 * 1024;
 
 /// The access to the node.
-enum Way<'a> {
+enum Access<'a> {
     /// By frames: this session has the SDO client.
     Bus(&'a mut dyn Adapter),
     /// By objects: the gateway has the SDO client.
@@ -41,7 +41,7 @@ enum Way<'a> {
 
 /// A conversation with one node.
 pub struct Session<'a> {
-    way: Way<'a>,
+    access: Access<'a>,
     node: NodeId,
     timing: Timing,
     transfers: Transfers,
@@ -68,12 +68,12 @@ impl fmt::Debug for Session<'_> {
 impl<'a> Session<'a> {
     /// A conversation with `node`. It sends nothing yet.
     pub fn new(adapter: &'a mut dyn Adapter, node: NodeId, timing: Timing) -> Self {
-        Self::over(Way::Bus(adapter), node, timing)
+        Self::over(Access::Bus(adapter), node, timing)
     }
 
     /// A conversation with a node behind a gateway.
     pub fn through(gateway: &'a mut dyn Gateway, node: NodeId, timing: Timing) -> Self {
-        Self::over(Way::Gateway(gateway), node, timing)
+        Self::over(Access::Gateway(gateway), node, timing)
     }
 
     /// A conversation over the target of a URL.
@@ -84,9 +84,9 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn over(way: Way<'a>, node: NodeId, timing: Timing) -> Self {
+    fn over(access: Access<'a>, node: NodeId, timing: Timing) -> Self {
         Self {
-            way,
+            access,
             node,
             timing,
             transfers: Transfers::default(),
@@ -105,15 +105,15 @@ impl<'a> Session<'a> {
     #[must_use]
     pub fn with(&mut self, node: NodeId, timing: Timing) -> Session<'_> {
         let (transfers, cancelled, answer) = (self.transfers, self.cancelled.clone(), self.answer);
-        let way = match &mut self.way {
-            Way::Bus(adapter) => Way::Bus(&mut **adapter),
-            Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
+        let access = match &mut self.access {
+            Access::Bus(adapter) => Access::Bus(&mut **adapter),
+            Access::Gateway(gateway) => Access::Gateway(&mut **gateway),
         };
         let (watch, on_silence, sharing) = (self.watch.clone(), self.on_silence, self.sharing);
         let takes_blocks = self.takes_blocks;
         let lacks_block_upload = self.lacks_block_upload && node == self.node;
         Session {
-            way,
+            access,
             node,
             timing,
             transfers,
@@ -187,23 +187,23 @@ impl<'a> Session<'a> {
     /// The time on the bus.
     #[must_use]
     pub fn now(&self) -> Duration {
-        match &self.way {
-            Way::Bus(adapter) => adapter.now(),
-            Way::Gateway(gateway) => gateway.now(),
+        match &self.access {
+            Access::Bus(adapter) => adapter.now(),
+            Access::Gateway(gateway) => gateway.now(),
         }
     }
 
     /// Whether the session receives the frames of other nodes. Behind a gateway it does not.
     #[must_use]
     pub fn hears_the_bus(&self) -> bool {
-        matches!(self.way, Way::Bus(_))
+        matches!(self.access, Access::Bus(_))
     }
 
     /// What the adapter knows about its bus apart from the frames.
     pub fn health(&mut self) -> Option<Health> {
-        match &mut self.way {
-            Way::Bus(adapter) => adapter.health(),
-            Way::Gateway(_) => None,
+        match &mut self.access {
+            Access::Bus(adapter) => adapter.health(),
+            Access::Gateway(_) => None,
         }
     }
 

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use canopen::{AbortCode, Address};
 
-use super::transfer::{VALUE_MAX, WORTH_BLOCKS};
-use super::{Session, Way, UPLOAD_MAX};
+use super::transfer::WORTH_BLOCKS;
+use super::{Access, Session};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
@@ -18,38 +18,22 @@ const GATEWAY_GRACE: Duration = Duration::from_secs(5);
 const GATEWAY_BYTES: u64 = 250;
 
 impl Session<'_> {
-    /// Reads a short value through the gateway.
-    pub(super) fn read_there(&mut self, at: Address) -> Result<Vec<u8>, Error> {
-        let value = self.upload_through(at, VALUE_MAX, &mut |_| {})?;
-        let long = Error::Protocol { doing: Doing::Read(at), code: AbortCode::OUT_OF_MEMORY };
-        if value.len() > VALUE_MAX {
-            Err(long)
-        } else {
-            Ok(value)
-        }
-    }
-
-    /// Reads a value of any length through the gateway.
+    /// Reads a value of at most this length through the gateway. Its first characters are due after the
+    /// time-out of the node and of the gateway; what a gateway collects before it answers must arrive by
+    /// then, too.
     pub(super) fn upload_there(
-        &mut self,
-        at: Address,
-        progress: &mut dyn FnMut(u32),
-    ) -> Result<Vec<u8>, Error> {
-        self.upload_through(at, UPLOAD_MAX, progress)
-    }
-
-    /// Reads a value of at most this length. Its first characters are due after the time-out of the
-    /// node and of the gateway; what a gateway collects before it answers must arrive by then, too.
-    fn upload_through(
         &mut self,
         at: Address,
         longest: usize,
         progress: &mut dyn FnMut(u32),
     ) -> Result<Vec<u8>, Error> {
-        let patience = self.timing.sdo + GATEWAY_GRACE;
-        self.through_gateway(at, Doing::Read(at), patience, longest, |gateway, ask| {
-            gateway.upload(ask, progress)
-        })
+        let (doing, patience) = (Doing::Read(at), self.timing.sdo + GATEWAY_GRACE);
+        let value =
+            self.through_gateway(at, doing, patience, longest, |gateway, ask| gateway.upload(ask, progress))?;
+        if value.len() > longest {
+            return Err(Error::Protocol { doing, code: AbortCode::OUT_OF_MEMORY });
+        }
+        Ok(value)
     }
 
     /// Writes a value through the gateway.
@@ -82,12 +66,12 @@ impl Session<'_> {
         let cancelled = move || flag.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed));
         let (node, sdo) = (self.node, self.timing.sdo);
         let ask = Ask { node, at, sdo, patience, longest, cancelled: &cancelled };
-        match &mut self.way {
-            Way::Gateway(gateway) => {
+        match &mut self.access {
+            Access::Gateway(gateway) => {
                 act(&mut **gateway, &ask).map_err(|error| of_gateway(error, node, doing))
             }
             // Callers have checked that there is a gateway.
-            Way::Bus(_) => Err(Error::NoAnswer { node, doing }),
+            Access::Bus(_) => Err(Error::NoAnswer { node, doing }),
         }
     }
 }

@@ -5,16 +5,16 @@ use canopen::program::SECOND_SERVER;
 use canopen::sdo::second::{INVALID, REQUEST, RESPONSE};
 use canopen::{Address, CobId};
 
-use super::{Session, Way};
+use super::{Access, Session};
 use crate::device::doing::Doing;
 use crate::device::error::Error;
 use coboot_can::adapter::{Group, Delivery};
 
 impl Session<'_> {
     fn group(&mut self) -> Option<&mut dyn Group> {
-        match &mut self.way {
-            Way::Bus(adapter) => adapter.group(),
-            Way::Gateway(_) => None,
+        match &mut self.access {
+            Access::Bus(adapter) => adapter.group(),
+            Access::Gateway(_) => None,
         }
     }
 

@@ -14,7 +14,7 @@ use crate::device::error::Error;
 use crate::device::timing::Transfers;
 
 /// The largest value that is read as a whole. All objects of a bootloader are much smaller.
-pub(super) const VALUE_MAX: usize = 4096;
+const VALUE_MAX: usize = 4096;
 /// A buffer that grows with the data that really arrive; an announced size reserves no memory.
 struct Grown(Vec<u8>);
 
@@ -82,7 +82,7 @@ impl Session<'_> {
     /// As [`read`](Self::read).
     pub fn read_once(&mut self, at: Address) -> Result<Vec<u8>, Error> {
         if !self.hears_the_bus() {
-            return self.read_there(at);
+            return self.upload_there(at, VALUE_MAX, &mut |_| {});
         }
         let mut bytes = [0; VALUE_MAX];
         let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
@@ -110,7 +110,7 @@ impl Session<'_> {
 
     fn upload_once(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         if !self.hears_the_bus() {
-            return self.upload_there(at, progress);
+            return self.upload_there(at, UPLOAD_MAX, progress);
         }
         let (sink, config, doing) = (|| Grown(Vec::new()), self.config(), Doing::Read(at));
         let by_blocks = self.transfers == Transfers::Blocks && !self.lacks_block_upload;
@@ -198,7 +198,7 @@ impl Session<'_> {
         let began = self.now();
         let mut deadline = began + self.timing.command;
         let mut cancelled = false;
-        let mut told = 0;
+        let mut reported = 0;
         let mut burst = 0;
         let mut short = None;
         loop {
@@ -234,9 +234,9 @@ impl Session<'_> {
                         let now = self.instant();
                         transfer.handle(&frame, now);
                         short = short_answer(&frame, self.node).or(short);
-                        if transfer.progress() != told {
-                            told = transfer.progress();
-                            progress(told);
+                        if transfer.progress() != reported {
+                            reported = transfer.progress();
+                            progress(reported);
                             if patience == Patience::ForEachStep {
                                 deadline = self.now() + self.timing.command;
                             }
@@ -252,18 +252,9 @@ impl Session<'_> {
                     }
                 }
                 Step::Done(_) if cancelled => return Err(Error::Cancelled),
-                Step::Done(Ok(())) => return Ok(()),
-                Step::Done(Err(SdoError::NoAnswer)) => {
-                    let node = self.node;
-                    return Err(match (short, doing) {
-                        (Some(len), Doing::Read(_)) => Error::ShortAnswer { node, doing, len },
-                        _ => Error::NoAnswer { node, doing },
-                    });
+                Step::Done(result) => {
+                    return result.map_err(|error| transfer_error(error, self.node, doing, short))
                 }
-                Step::Done(Err(SdoError::Server(code))) => {
-                    return Err(Error::Refused { node: self.node, doing, code })
-                }
-                Step::Done(Err(SdoError::Client(code))) => return Err(Error::Protocol { doing, code }),
             }
         }
     }
@@ -272,6 +263,16 @@ impl Session<'_> {
     /// does no harm.
     fn instant(&self) -> Instant {
         Instant::from_millis(self.now().as_millis() as u32)
+    }
+}
+
+/// The error of a transfer that has ended by `error`; `short` is the length of an answer that was too short.
+fn transfer_error(error: SdoError, node: NodeId, doing: Doing, short: Option<usize>) -> Error {
+    match (error, short, doing) {
+        (SdoError::NoAnswer, Some(len), Doing::Read(_)) => Error::ShortAnswer { node, doing, len },
+        (SdoError::NoAnswer, ..) => Error::NoAnswer { node, doing },
+        (SdoError::Server(code), ..) => Error::Refused { node, doing, code },
+        (SdoError::Client(code), ..) => Error::Protocol { doing, code },
     }
 }
 

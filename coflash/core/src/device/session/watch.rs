@@ -44,7 +44,7 @@ pub(super) struct Watch {
     /// The time of the node's last frame: an answer, a heartbeat or an emergency.
     pub(super) heard: Option<Duration>,
     /// Whether this silence was reported.
-    pub(super) told: bool,
+    pub(super) reported: bool,
     /// The session's own requests without an echo, in their order.
     own: Echoes<OWN_MAX>,
     /// Whether an echo has arrived since the last answer.
@@ -101,7 +101,7 @@ impl Watch {
             return;
         }
         if [CobId::sdo_response(node), CobId::heartbeat(node), CobId::emcy(node)].contains(&id) {
-            (self.heard, self.told) = (Some(now), false);
+            (self.heard, self.reported) = (Some(now), false);
         }
         if let Some(booted) = parse_boot_up(frame) {
             self.heard_boot_up(booted, node, now);

@@ -80,13 +80,13 @@ impl Procedure for Block {
         }
         update.state = DeviceState::Unreleased;
         if !options.start {
-            update.tell(Phase::NotReleased.into());
+            update.report(Phase::NotReleased.into());
             return Ok(Downloaded { repeats, took, released: Some(false), renewal: None });
         }
         if options.trial_run {
             trial::run(session, update)?;
         }
-        steps::release(session, number, &mut |event| update.tell(event))?;
+        steps::release(session, number, &mut |event| update.report(event))?;
         update.state = DeviceState::Released;
         Ok(Downloaded { repeats, took, released: Some(true), renewal: None })
     }
@@ -191,14 +191,14 @@ fn send_verified(
     }
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, update)?;
-        steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
+        steps::verify(session, number, crcs, &mut |event| update.report(event))?;
         Ok(sent)
     };
     match all(partial, update) {
         Err(error @ (Error::Failed { .. } | Error::WrongCrc { .. } | Error::Refused { .. }))
             if partial.is_some() =>
         {
-            update.tell(Warning::BeginsAgain { why: error.to_string() }.into());
+            update.report(Warning::BeginsAgain { why: error.to_string() }.into());
             all(None, update)
         }
         result => result,
@@ -222,8 +222,8 @@ fn send(
         let done = partial.end.saturating_sub(file.own.start()) as usize;
         // The record of the old program goes with the first good data.
         update.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
-        update.tell(Phase::GoingOn { done: done.min(total), total }.into());
-    } else if let Err(error) = steps::erase(session, number, &mut |event| update.tell(event)) {
+        update.report(Phase::GoingOn { done: done.min(total), total }.into());
+    } else if let Err(error) = steps::erase(session, number, &mut |event| update.report(event)) {
         if error.is_refusal() {
             update.erases_not();
         }
@@ -252,7 +252,7 @@ fn send_blocks(
     let mut total = size(&blocks);
     let mut may_split = file.joined.is_some() && !*in_group;
     let (mut done, mut repeats, mut in_vain) = (0, 0, 0);
-    update.tell(Event::Progress { done, total });
+    update.report(Event::Progress { done, total });
     while let Some(block) = blocks.pop_front() {
         let bytes = file.own.emit_block(&block, checksum);
         if partial.is_some_and(|partial| partial.has(&block)) {
@@ -284,7 +284,7 @@ fn send_blocks(
         repeats += sent.repeats;
         if sent.by_other_crc {
             checksum = checksum.other();
-            update.tell(Note::OtherCrc { crc: checksum }.into());
+            update.report(Note::OtherCrc { crc: checksum }.into());
             if std::mem::take(in_group) {
                 session.part_from_group()?;
             }
@@ -300,7 +300,7 @@ fn send_blocks(
             continue;
         }
         done += bytes.len();
-        update.tell(Event::Progress { done, total });
+        update.report(Event::Progress { done, total });
     }
     Ok(repeats)
 }
@@ -359,7 +359,7 @@ fn send_block(
         let end = Sent { repeats: repeats.count, by_other_crc, split: false };
         let sent = match delivery {
             Delivery::Taken(devices) => {
-                update.tell(Note::Together { devices }.into());
+                update.report(Note::Together { devices }.into());
                 // A block that the device cannot write is reported with the next one.
                 return Ok(end);
             }
@@ -367,10 +367,10 @@ fn send_block(
             Delivery::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
             Delivery::Alone | Delivery::Disturbed => {
                 if delivery == Delivery::Disturbed {
-                    update.tell(Warning::GroupDisturbed.into());
+                    update.report(Warning::GroupDisturbed.into());
                 }
                 let mut progress =
-                    |part: u32| update.tell(Event::Progress { done: done + part as usize, total });
+                    |part: u32| update.report(Event::Progress { done: done + part as usize, total });
                 session.write(at, bytes, doing, &mut progress)
             }
         };
@@ -395,7 +395,7 @@ fn send_block(
             by_other_crc = !by_other_crc;
             bytes = if by_other_crc { other } else { own };
         }
-        update.tell(Event::Retry(retry));
+        update.report(Event::Retry(retry));
         if repeats.count > 1 && may_split && !in_doubt {
             return Ok(Sent { repeats: repeats.count, split: true, ..end });
         }

@@ -27,7 +27,7 @@ impl Procedure for Cia302 {
             update.state = DeviceState::Called;
             stop_program(session, update.options.program, update)?;
         }
-        update.tell(Note::Dialect { dialect: self.0 }.into());
+        update.report(Note::Dialect { dialect: self.0 }.into());
         Ok(self.0)
     }
 }
@@ -46,13 +46,13 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
     };
     update.called = Some(running);
     let at = Address::new(program::PROGRAM_CONTROL, running);
-    update.tell(Phase::CallingBack.into());
+    update.report(Phase::CallingBack.into());
     let began = session.now();
     match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
             call_back(session)?;
-            update.tell(Phase::InBootloader.into());
+            update.report(Phase::InBootloader.into());
             return Ok(());
         }
         Err(error) => return Err(error),
@@ -74,6 +74,6 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;
     }
-    update.tell(Phase::InBootloader.into());
+    update.report(Phase::InBootloader.into());
     Ok(())
 }

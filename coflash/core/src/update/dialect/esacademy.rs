@@ -6,15 +6,14 @@ use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
 use super::procedure::Procedure;
-use super::restart::{arrived, reset_program};
 use super::whole::idle;
-use crate::device::error::{absent, optional};
+use crate::device::error::{absent, reported};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::event::Note;
 use crate::update::judge::DownloadStatus;
 use crate::update::password::Password;
 use crate::update::running::RunningUpdate;
-use crate::update::steps::await_application;
+use crate::update::steps::{await_application, await_program, reset_program};
 
 /// ESAcademy's password for 7F50h: "INIT".
 pub const PASSWORD: u32 = 0x494E_4954;
@@ -35,7 +34,7 @@ impl Procedure for EsAcademy {
         update: &mut RunningUpdate<'_>,
     ) -> Result<(), Error> {
         if self.unlock(session, update.options.unlock, number)? {
-            update.tell(Note::Unlocked.into());
+            update.report(Note::Unlocked.into());
         }
         Ok(())
     }
@@ -51,7 +50,7 @@ impl Procedure for EsAcademy {
         }
         let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {
             Err(Error::NoAnswer { .. }) => None,
-            register => optional(register)?,
+            register => reported(register)?,
         };
         let failed = register.is_some_and(|bits| bits & ERROR_BITS == ERROR_BITS);
         Ok(failed.then_some((FlashError::Unspecified, 0)))
@@ -87,7 +86,8 @@ impl Procedure for EsAcademy {
         if let Some(running) = await_application(session, BY_ITSELF.min(boot))? {
             return Ok(running);
         }
+        let began = session.now();
         reset_program(session, number)?;
-        arrived(session, number)
+        await_program(session, number, began)
     }
 }

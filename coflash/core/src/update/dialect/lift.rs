@@ -7,7 +7,6 @@ use canopen::program::LIFT_NODE_ID;
 use canopen::{AbortCode, Address, NodeId};
 
 use super::procedure::Procedure;
-use super::restart::{arrived, reset_program};
 use crate::device::flying_master::{self, Asked};
 use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
@@ -18,7 +17,7 @@ use crate::update::options::FlashOptions;
 use crate::update::password::Password;
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
-use crate::update::steps::settle;
+use crate::update::steps::{await_program, reset_program, settle};
 
 /// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
 /// (CiA 814-1 clause 6.4).
@@ -46,15 +45,15 @@ impl Procedure for Lift {
             let what = "the bootloaders share a node-ID: update the devices one after the other";
             return Err(Error::NotInDialect { dialect: Dialect::Lift, what });
         }
-        update.tell(Note::Dialect { dialect: Dialect::Lift }.into());
-        update.tell(Note::Nameplate(Box::new(nameplate(session)?)).into());
+        update.report(Note::Dialect { dialect: Dialect::Lift }.into());
+        update.report(Note::Nameplate(Box::new(nameplate(session)?)).into());
         check(session, found.running, options.unlock)?;
         if options.mastership {
             match flying_master::ask(session)? {
                 Asked::Nobody => {}
-                Asked::Kept(master) => update.tell(Warning::MasterKept { node: master.node }.into()),
+                Asked::Kept(master) => update.report(Warning::MasterKept { node: master.node }.into()),
                 Asked::Taken(taken) => {
-                    update.tell(Note::MasterTaken { node: taken.from.node }.into());
+                    update.report(Note::MasterTaken { node: taken.from.node }.into());
                     update.mastership = Some(taken);
                 }
             }
@@ -74,6 +73,7 @@ impl Procedure for Lift {
     }
 
     fn start(&self, session: &mut Session<'_>, original: NodeId, number: u8) -> Result<DeviceType, Error> {
+        let began = session.now();
         reset_program(session, LIFT_PROGRAM)?;
         if original == lift_node() {
             let boot = session.timing().boot;
@@ -83,7 +83,7 @@ impl Procedure for Lift {
         } else {
             session.talk_to(original);
         }
-        arrived(session, number)
+        await_program(session, number, began)
     }
 }
 
@@ -102,10 +102,10 @@ fn unlock_bootloader(
     let lift = lift_node();
     if node != lift {
         unlock(session, password)?;
-        update.tell(Note::Unlocked.into());
+        update.report(Note::Unlocked.into());
         update.state = DeviceState::Called;
         update.called = Some(LIFT_PROGRAM);
-        update.tell(Phase::CallingBack.into());
+        update.report(Phase::CallingBack.into());
         match reset_program(session, LIFT_PROGRAM) {
             // It knows the command, and does not leave.
             Err(Error::Refused { node, code, .. }) => {
@@ -120,11 +120,11 @@ fn unlock_bootloader(
         if !running.is_some_and(DeviceType::is_bootloader) {
             return Err(Error::NoBootloader { node: lift, running, code: None, elsewhere: None });
         }
-        update.tell(Note::Moved { node: lift }.into());
-        update.tell(Phase::InBootloader.into());
+        update.report(Note::Moved { node: lift }.into());
+        update.report(Phase::InBootloader.into());
     }
     unlock(session, password)?;
-    update.tell(Note::Unlocked.into());
+    update.report(Note::Unlocked.into());
     Ok(())
 }
 
@@ -145,10 +145,10 @@ fn check(session: &mut Session<'_>, running: DeviceType, password: Option<Passwo
             Err(Error::NoBootloader { node, running: Some(running), code: None, elsewhere: None })
         };
     }
-    let mut look = session.with(lift, brief(session.timing()));
-    let there = look.device_type()?.is_some()
-        || look.hears_the_bus()
-            && look.observe_until(HEARTBEAT, &mut |frame| {
+    let mut asked = session.with(lift, brief(session.timing()));
+    let there = asked.device_type()?.is_some()
+        || asked.hears_the_bus()
+            && asked.observe_until(HEARTBEAT, &mut |frame| {
                 parse_state_message(frame).is_some_and(|(node, _)| node == lift)
             })?;
     if there {
@@ -189,7 +189,7 @@ pub fn read_locked(
     at: Address,
     dialect: Option<Dialect>,
     password: Option<Password>,
-    tell: &mut dyn FnMut(Event),
+    on_event: &mut dyn FnMut(Event),
 ) -> Result<Vec<u8>, Error> {
     let running = session.find()?;
     let dialect = match dialect {
@@ -208,7 +208,11 @@ pub fn read_locked(
     }
     let original = session.node();
     check(session, running, password)?;
-    unlock_bootloader(session, password, &mut RunningUpdate::new(original, FlashOptions::default(), tell))?;
+    unlock_bootloader(
+        session,
+        password,
+        &mut RunningUpdate::new(original, FlashOptions::default(), on_event),
+    )?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
         let restarted = reset_program(session, LIFT_PROGRAM);

@@ -10,8 +10,8 @@
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
 //! `raw` and `hex` are one procedure. The renewal of a bootloader is one more, in every
-//! dialect. To add a dialect, add a row to [`Dialect`], and here
-//! a file that implements `Procedure` and a line in `each.rs`.
+//! dialect. To add a dialect, add a row to [`Dialect`], and here a file that implements `Procedure` and
+//! its lines in this file.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
 use super::payload::Payload;
@@ -19,15 +19,12 @@ use crate::device::Dialect;
 
 mod block;
 mod cia302;
-mod each;
 mod esacademy;
 mod lift;
 mod procedure;
 mod renew;
-mod restart;
 mod whole;
 
-pub(super) use self::each::of;
 pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
 pub use self::lift::read_locked;
 pub(super) use self::procedure::{Downloaded, Procedure};
@@ -37,6 +34,17 @@ pub(super) use self::procedure::{Downloaded, Procedure};
 #[must_use]
 pub const fn is_data(dialect: Dialect, program: u8) -> bool {
     matches!(dialect, Dialect::Lift) && program != lift::LIFT_PROGRAM
+}
+
+/// The procedure of this dialect for a program.
+pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
+    match dialect {
+        Dialect::Block => &block::Block,
+        Dialect::Raw => &cia302::Cia302(Dialect::Raw),
+        Dialect::Hex => &cia302::Cia302(Dialect::Hex),
+        Dialect::Lift => &lift::Lift,
+        Dialect::EsAcademy => &esacademy::EsAcademy,
+    }
 }
 
 /// The procedure for this payload in this dialect.

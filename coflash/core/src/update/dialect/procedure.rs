@@ -12,7 +12,7 @@ use crate::update::judge::DownloadStatus;
 use crate::update::password::Password;
 use crate::update::payload::Payload;
 use crate::update::reach::Found;
-use crate::update::renewal::Renewal;
+use crate::update::report::Renewal;
 use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
@@ -30,7 +30,7 @@ pub(in crate::update) trait Procedure {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         let dialect = call_back(session, found, update)?;
-        update.tell(Note::Dialect { dialect }.into());
+        update.report(Note::Dialect { dialect }.into());
         Ok(dialect)
     }
 
@@ -58,7 +58,7 @@ pub(in crate::update) trait Procedure {
         number: u8,
         update: &mut RunningUpdate<'_>,
     ) -> Result<(), Error> {
-        steps::clear_and_wait(session, number, &mut |event| update.tell(event))
+        steps::clear_and_wait(session, number, &mut |event| update.report(event))
     }
 
     /// Reads the device's result of one download.
@@ -120,9 +120,9 @@ pub(super) fn call_back(
     let program = steps::running_program(session, update.options.program)?;
     update.state = DeviceState::Called;
     update.called = Some(program.unwrap_or(steps::CALL_BACK));
-    update.tell(Phase::CallingBack.into());
+    update.report(Phase::CallingBack.into());
     let running = steps::call_back(session)?;
-    update.tell(Phase::InBootloader.into());
+    update.report(Phase::InBootloader.into());
     let its = Dialect::of_bootloader(running, session.node());
     Ok(update.options.dialect.or(its).unwrap_or(found.dialect))
 }

@@ -6,11 +6,11 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
-use super::each::of;
+use super::of;
 use super::procedure::{call_back, Downloaded, Procedure};
 use super::whole;
 use crate::device::access::takes_open;
-use crate::device::error::told;
+use crate::device::error::reported;
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::{Dialect, Doing, Error, Form, Session};
 use crate::update::device_after::DeviceState;
@@ -19,7 +19,7 @@ use crate::update::judge::DownloadStatus;
 use crate::update::options::FlashOptions;
 use crate::update::payload::Payload;
 use crate::update::reach::{find, Found};
-use crate::update::renewal::Renewal;
+use crate::update::report::Renewal;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::{execute, identification};
 
@@ -66,13 +66,13 @@ impl Procedure for Renew {
         // a device that is silent; the next power-on starts it there.
         let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
         let again = update.called.filter(|_| update.options.start && !is_silent).map(|program| {
-            update.tell(Phase::Starting.into());
+            update.report(Phase::Starting.into());
             of(update.dialect).start(session, update.original, program)
         });
         let renewal = result?;
         let running = again.transpose()?;
         if let Some(running) = running {
-            update.tell(Phase::Started(running).into());
+            update.report(Phase::Started(running).into());
         }
         update.state = DeviceState::Untouched;
         let Renewal { repeats, transfer: took, .. } = renewal;
@@ -108,7 +108,7 @@ fn renew(
     if is_same && running.state != State::Staged && !update.options.force {
         return Ok(unchanged);
     }
-    update.tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
+    update.report(Phase::Renewing { number, from: from.0, to: to.0 }.into());
     if !(is_same && is_open) {
         leave_trial(session, number, running, update)?;
         let began = session.now();
@@ -119,10 +119,10 @@ fn renew(
             // The device has found the same image.
             return Ok(unchanged);
         }
-        update.tell(Phase::Staged.into());
+        update.report(Phase::Staged.into());
         try_it(session, number)?;
     }
-    update.tell(Phase::OnTrial.into());
+    update.report(Phase::OnTrial.into());
     if let Err(error) = unlock(session, number, update).and_then(|()| install(session, number)) {
         let is_refusal = matches!(error, Error::Failed { .. } | Error::Refused { .. });
         // A bootloader that is not confirmed need not wait for its end. The reason stays the result.
@@ -140,7 +140,7 @@ fn renew(
         }
     }
     let to = bootloader(session)?.map_or(to, |now| now.version);
-    update.tell(Phase::Installed { version: to.0 }.into());
+    update.report(Phase::Installed { version: to.0 }.into());
     Ok(Renewal { to, unchanged: false, repeats, transfer, ..unchanged })
 }
 
@@ -251,7 +251,7 @@ fn await_other_image(session: &mut Session<'_>, limit: Duration) -> Result<Optio
     loop {
         let pause = session.timing().sdo;
         match session.device_type()? {
-            Some(running) if running.is_bootloader() => match told(progress(session))? {
+            Some(running) if running.is_bootloader() => match reported(progress(session))? {
                 Some(Some(progress)) => return Ok(Some(progress)),
                 // A state of a later version.
                 Some(None) => return Err(Error::Unconfirmable { node: session.node() }),

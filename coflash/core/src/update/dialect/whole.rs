@@ -40,7 +40,7 @@ pub(super) fn download(
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
-        steps::verify(session, number, file.crcs(), &mut |event| update.tell(event))?;
+        steps::verify(session, number, file.crcs(), &mut |event| update.report(event))?;
     }
     Ok(Downloaded { repeats, took, released: None, renewal: None })
 }
@@ -69,14 +69,14 @@ pub(super) fn send(
             }
             return Err(error);
         }
-        update.tell(Event::Progress { done: 0, total });
+        update.report(Event::Progress { done: 0, total });
         let slow = Timing { sdo: SLOW_SEGMENT.max(session.timing().sdo), ..*session.timing() };
         let node = session.node();
         let mut long = session.with(node, slow);
         let mut progress = |part: u32| {
             update.wrote |= part > 0;
             update.postponed &= part == 0;
-            update.tell(Event::Progress { done: part as usize, total });
+            update.report(Event::Progress { done: part as usize, total });
         };
         let sent = long.write(at, content, doing, &mut progress);
         let transfers = long.transfers();
@@ -88,7 +88,7 @@ pub(super) fn send(
         }
         let status = procedure.status(session, number, doing)?;
         let Err(failure) = judge(sent, status, doing) else { return Ok(repeats.count) };
-        update.tell(Event::Retry(repeats.again(session, failure)?));
+        update.report(Event::Retry(repeats.again(session, failure)?));
     }
 }
 

@@ -169,8 +169,8 @@ fn silence_about_an_object_costs_its_own_cell() {
     for at in [(0x1001, 0), (0x1009, 0), (0x1018, 4), (0x1F51, 0), (0x2002, 1), (0x6005, 1)] {
         let mut fake = Fake::new(APPLICATION);
         fake.maker = Some(Box::new(Peculiar(at, Err(SILENT))));
-        let told = info(&mut session(&mut fake)).unwrap_or_else(|error| panic!("{at:X?}: {error}"));
-        assert_eq!((told.identity[0], told.identity[3]), (Some(0x3F), None), "{at:X?}");
+        let reported = info(&mut session(&mut fake)).unwrap_or_else(|error| panic!("{at:X?}: {error}"));
+        assert_eq!((reported.identity[0], reported.identity[3]), (Some(0x3F), None), "{at:X?}");
     }
     // One that falls silent is gone.
     let mut fake = Fake::new(APPLICATION);
@@ -204,14 +204,14 @@ fn a_refused_object_costs_its_own_cell() {
         for value in refusals.iter().cloned().chain([Ok(vec![1, 2, 3, 4, 5, 6, 7, 8, 9])]) {
             let mut fake = Fake::new(BOOTLOADER);
             fake.maker = Some(Box::new(Peculiar(at, value.clone())));
-            let told =
+            let reported =
                 info(&mut session(&mut fake)).unwrap_or_else(|error| panic!("{at:X?}, {value:X?}: {error}"));
-            assert_eq!(told.device_type.0, BOOTLOADER);
+            assert_eq!(reported.device_type.0, BOOTLOADER);
             let vendor = (at != (0x1018, 1)).then_some(0x3F);
-            assert_eq!(told.identity[0], vendor, "{at:X?}, {value:X?}");
+            assert_eq!(reported.identity[0], vendor, "{at:X?}, {value:X?}");
             let found =
                 scan(&mut fake, &ScanOptions::default().nodes(vec![node()]), &Arc::default()).unwrap();
-            assert_eq!(found[&node()].info, Some(told), "{at:X?}");
+            assert_eq!(found[&node()].info, Some(reported), "{at:X?}");
         }
     }
 }

@@ -77,8 +77,8 @@ fn another_devices_label_is_refused_in_every_dialect() {
         for dialect in DIALECTS {
             for running in [APPLICATION, BOOTLOADER] {
                 // By block 0, which has what the label has; and by the label alone.
-                for told in [Told::default(), Told::None] {
-                    let file = file(&labelled(vendor_id, product_code), START, told);
+                for reported in [Told::default(), Told::None] {
+                    let file = file(&labelled(vendor_id, product_code), START, reported);
                     let error = refused(&mut Fake::new(running), &file, speaks(dialect));
                     assert_eq!((error.number(), error.to_string().as_str()), (number, words), "{dialect:?}");
                 }
@@ -86,8 +86,8 @@ fn another_devices_label_is_refused_in_every_dialect() {
         }
     }
     // Block 0 counts, too, if it differs from the label.
-    let told = Told::Device { vendor_id: VENDOR, product_code: PRODUCT + 1 };
-    let file = file(&labelled(VENDOR, PRODUCT), START, told);
+    let reported = Told::Device { vendor_id: VENDOR, product_code: PRODUCT + 1 };
+    let file = file(&labelled(VENDOR, PRODUCT), START, reported);
     assert_eq!(refused(&mut Fake::new(APPLICATION), &file, FlashOptions::default()).number(), 0x6000_0182);
 }
 
@@ -318,10 +318,10 @@ fn what_a_sealed_device_takes_is_shown() {
     let mut fake = Fake::new(APPLICATION);
     fake.maker = Some(Box::new(Sealed(vec![APPLICATION])));
     let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
-    let told = info(&mut session).unwrap();
+    let reported = info(&mut session).unwrap();
     let line = "  sealed            yes, roots 12345678h, 9ABCDEF0h, counter 7, epoch 4\n";
-    assert!(told.to_string().contains(line), "{told}");
-    let json = serde_json::to_value(&told).unwrap();
+    assert!(reported.to_string().contains(line), "{reported}");
+    let json = serde_json::to_value(&reported).unwrap();
     let security = serde_json::json!({
         "sealed": true, "roots": ["12345678h", "9ABCDEF0h"], "counters": [7], "epoch": 4
     });

@@ -150,12 +150,14 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
 #[test]
 fn lifts_are_not_updated_together() {
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
-    let jobs = [Job::new(node(NODE), Arc::new(file()), locked(PHRASE))];
+    // The second one is not there. A lift alone is followed to its other node-ID.
+    let jobs = [NODE, NODE + 1].map(|id| Job::new(node(id), Arc::new(file()), locked(PHRASE)));
     let options = ManyOptions::default().transfers(Transfers::Segments).at_once(1);
     let results = flash_many(&mut fake, &jobs, &options, &|_, _| {});
     let failed = results.into_iter().next().unwrap().unwrap_err();
     assert!(matches!(failed.error, Error::NotInDialect { dialect: Dialect::Lift, .. }), "{}", failed.error);
     assert!(fake.writes().is_empty());
+    assert!(flash_many(&mut fake, &jobs[..1], &options, &|_, _| {})[0].is_ok());
 }
 
 #[test]

@@ -42,6 +42,17 @@ fn fails(fake: &mut Fake) -> Error {
     run(fake, FlashOptions::default()).0.unwrap_err()
 }
 
+/// A device that runs this, and differs by `change` from one without faults.
+fn device(running: u32, change: impl FnOnce(&mut Fake)) -> Fake {
+    let mut fake = Fake::new(running);
+    change(&mut fake);
+    fake
+}
+
+fn bootloader(change: impl FnOnce(&mut Fake)) -> Fake {
+    device(BOOTLOADER, change)
+}
+
 /// For the first `times` times of `number` this result, then normal.
 fn script<T: PartialEq + Copy + Send + 'static>(
     number: T,
@@ -133,50 +144,32 @@ fn progress_never_goes_back_and_ends_complete() {
     assert!(seen > 100, "about one for each segment of seven bytes: {seen}");
 }
 
+/// With the form of the downloads at the end, the repetitions and the block downloads. Block 0 and the last
+/// one have 28 and 24 bytes: four segments cost no more than the frames around a block. One that refuses block
+/// transfer is asked once for it, and one that does not answer twice.
 #[test]
 fn blocks_are_used_where_the_device_knows_them() {
-    for blksize in [1, 2, 5, 127] {
-        let mut fake = Fake::new(APPLICATION);
-        fake.knows_blocks = Blocks::Known(blksize);
-        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
-        assert_eq!((report.transfers, report.repeats), (Transfers::Blocks, 0));
-        // Block 0 and the last one have 28 and 24 bytes: four segments cost no more than the frames
-        // around a block.
-        assert_eq!(fake.block_downloads, BLOCKS - 2);
-    }
-}
-
-#[test]
-fn a_device_without_blocks_is_asked_once_for_them() {
-    for code in [0x0504_0001, 0x0601_0000, 0x0800_0000] {
-        let mut fake = Fake::new(APPLICATION);
-        fake.knows_blocks = Blocks::Refused(code);
-        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
-        assert_eq!((report.transfers, report.repeats), (Transfers::Segments, 0));
-        assert_eq!(fake.block_downloads, 1);
+    let known = [1, 2, 5, 127].map(Blocks::Known).map(|knows| (knows, (Transfers::Blocks, 0, BLOCKS - 2)));
+    let refused = [0x0504_0001, 0x0601_0000, 0x0800_0000].map(Blocks::Refused);
+    let refused = refused.map(|knows| (knows, (Transfers::Segments, 0, 1)));
+    let ignored = (Blocks::Ignored, (Transfers::Segments, 2, 2));
+    for (knows_blocks, expected) in known.into_iter().chain(refused).chain([ignored]) {
+        for running in [APPLICATION, BOOTLOADER] {
+            let mut fake = device(running, |fake| fake.knows_blocks = knows_blocks);
+            let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+            assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+            assert_eq!((report.transfers, report.repeats, fake.block_downloads), expected);
+        }
     }
     // Any other abort concerns the value, and is not a reason for another form of download.
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.knows_blocks = Blocks::Refused(0x0607_0012);
+    let mut fake = bootloader(|fake| fake.knows_blocks = Blocks::Refused(0x0607_0012));
     let error = fails(&mut fake);
     assert_eq!((error.number(), fake.block_downloads), (0x6000_0025, 1));
 }
 
 #[test]
-fn a_device_that_does_not_answer_to_blocks_gets_segments() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.knows_blocks = Blocks::Ignored;
-    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
-    assert_eq!((report.transfers, report.repeats, fake.block_downloads), (Transfers::Segments, 2, 2));
-}
-
-#[test]
 fn no_block_is_tried_where_segments_are_asked_for() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.knows_blocks = Blocks::Known(127);
+    let mut fake = bootloader(|fake| fake.knows_blocks = Blocks::Known(127));
     let mut session = Session::new(&mut fake, node(), Timing::default());
     session.transfer_by(Transfers::Segments);
     flash(&mut session, file(), &FlashOptions::default(), &mut |_| {}).unwrap();
@@ -360,8 +353,7 @@ fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
         let repeats = u32::from(file != wanted);
         assert_eq!((report.repeats, fake.count("command 03")), (repeats, 1));
         // A damaged block 0 looks the same: the other CRC is then in vain.
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.on_block = script(0, 1, Outcome::Status(0x06));
+        let mut fake = bootloader(|fake| fake.on_block = script(0, 1, Outcome::Status(0x06)));
         assert_eq!(sent(&mut fake, FlashOptions::default()).unwrap().repeats, 2 - repeats);
         assert!(fake.blocks.concat() == wanted);
         if repeats > 0 {
@@ -377,21 +369,21 @@ fn a_file_for_another_device_erases_nothing() {
     assert_eq!((target.vendor_id, target.product_code), (0, 1234));
     let check = |check_target| FlashOptions::default().check_target(Some(check_target));
     for running in [APPLICATION, BOOTLOADER] {
+        let checked = |target| {
+            let mut fake = Fake::new(running);
+            let (result, events) = run(&mut fake, check(target));
+            (result, events, fake)
+        };
         // The fake has vendor-ID 3Fh and product code 1234.
-        let mut fake = Fake::new(running);
-        let (result, events) = run(&mut fake, check(Target { vendor_id: 0x40, ..target }));
+        let (result, events, fake) = checked(Target { vendor_id: 0x40, ..target });
         let error = result.unwrap_err();
         assert_eq!(error.number(), 0x6000_0180);
         assert_eq!(error.to_string(), "the program is for vendor-ID 00000040h, and node 5 has 0000003Fh");
         assert_eq!((fake.writes().len(), left(&events)), (0, DeviceState::Untouched));
-
-        let mut fake = Fake::new(running);
-        let error = run(&mut fake, check(Target { vendor_id: 0x3F, product_code: 1235 })).0.unwrap_err();
-        assert_eq!((error.number(), fake.writes().len()), (0x6000_0182, 0));
-
-        let mut fake = Fake::new(running);
-        let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
-        run(&mut fake, right).0.unwrap();
+        let (result, _, fake) = checked(Target { vendor_id: 0x3F, product_code: 1235 });
+        assert_eq!((result.unwrap_err().number(), fake.writes().len()), (0x6000_0182, 0));
+        let (result, _, fake) = checked(Target { vendor_id: 0x3F, product_code: 1234 });
+        assert!(result.is_ok(), "{result:?}");
         // Before the update; bootloader and program on trial, which are compared; and the program
         // with the file. The identity in block 0 is always compared, except for a vendor-ID of
         // "any".
@@ -411,8 +403,7 @@ fn verify_looks_once_more_at_the_running_program() {
     let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
     assert_eq!(*last, Phase::VerifiedAgain { crc: file().crc() }.into());
     // A program that reports another CRC while it runs.
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.crc_of_application = Some(0x1234_5678);
+    let mut fake = bootloader(|fake| fake.crc_of_application = Some(0x1234_5678));
     let (result, events) = run(&mut fake, options);
     assert_eq!(result.unwrap_err().number(), 0x6000_0001);
     assert_eq!(left(&events), DeviceState::Released);
@@ -488,8 +479,7 @@ fn a_program_that_fails_its_trial_is_not_released() {
 
 #[test]
 fn nobody_there() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.running = None;
+    let mut fake = bootloader(|fake| fake.running = None);
     let began = fake.now;
     let error = fails(&mut fake);
     assert_eq!(error.number(), 0x6000_0013);
@@ -502,21 +492,18 @@ fn nobody_there() {
     );
 }
 
+/// One that is silent for a while, and one that answers on before it restarts.
 #[test]
 fn a_device_that_is_just_restarting_is_waited_for() {
-    let mut fake = Fake::new(APPLICATION);
-    fake.restart_time = Duration::from_millis(3500);
-    run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!((fake.count("command 80"), fake.count("command 01")), (2, 2));
-}
-
-#[test]
-fn a_device_that_answers_on_before_it_restarts_is_not_taken_for_one_that_stays() {
-    let mut fake = Fake::new(APPLICATION);
-    fake.leave_time = Duration::from_millis(1200);
-    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!((fake.count("command 80"), fake.count("command 01")), (2, 2));
-    assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
+    for (restart, leave) in [(Some(3500), None), (None, Some(1200))] {
+        let mut fake = device(APPLICATION, |fake| {
+            fake.restart_time = restart.map_or(fake.restart_time, Duration::from_millis);
+            fake.leave_time = leave.map_or(fake.leave_time, Duration::from_millis);
+        });
+        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+        assert_eq!((fake.count("command 80"), fake.count("command 01")), (2, 2));
+        assert_eq!(report.running.map(|running| running.0), Some(APPLICATION));
+    }
 }
 
 #[test]
@@ -551,8 +538,7 @@ const STATUS: [(u32, u32, &str); 14] = [
 #[test]
 fn a_write_protected_sector_is_named_with_the_way_out() {
     for outcome in [Outcome::Status(0x0004_000E), Outcome::AbortStatus(0x0800_0020, 0x0004_000E)] {
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.on_block = script(1, usize::MAX, outcome);
+        let mut fake = bootloader(|fake| fake.on_block = script(1, usize::MAX, outcome));
         let error = fails(&mut fake);
         let text = error.to_string();
         let words = "writing block 1 failed: sector 4 of the flash is write-protected (1F57h reads 0Eh";
@@ -567,8 +553,7 @@ fn a_write_protected_sector_is_named_with_the_way_out() {
 fn every_status_of_the_manual_has_its_number_and_words() {
     for (status, number, words) in STATUS {
         for outcome in [Outcome::Status(status), Outcome::AbortStatus(0x0800_0020, status)] {
-            let mut fake = Fake::new(BOOTLOADER);
-            fake.on_block = script(2, usize::MAX, outcome);
+            let mut fake = bootloader(|fake| fake.on_block = script(2, usize::MAX, outcome));
             let error = fails(&mut fake);
             let text = error.to_string();
             assert_eq!(error.number(), number, "{text}");
@@ -578,20 +563,16 @@ fn every_status_of_the_manual_has_its_number_and_words() {
             assert_eq!(fake.count("command 83") + fake.count("block 3"), 0, "the procedure ends here");
             let repeatable = matches!(status, 0x06 | 0x86);
             assert_eq!(fake.count("block 2"), if repeatable { 4 } else { 1 }, "{text}");
-
-            let mut fake = Fake::new(BOOTLOADER);
-            fake.on_command = script(0x03, usize::MAX, outcome);
-            let error = fails(&mut fake);
-            assert_eq!(error.number(), number);
-            assert!(error.to_string().starts_with("erasing the program failed: "), "{error}");
-            assert_eq!(fake.writes(), ["command 03"]);
-
-            let mut fake = Fake::new(BOOTLOADER);
-            fake.on_command = script(0x83, usize::MAX, outcome);
-            let error = fails(&mut fake);
-            assert_eq!(error.number(), number);
-            assert!(error.to_string().starts_with("releasing the program for autostart failed: "), "{error}");
-            assert_eq!(fake.count("command 01"), 1, "that of the trial");
+            // The start before the release is that of the trial.
+            for (command, words, starts) in
+                [(0x03, "erasing the program", 0), (0x83, "releasing the program for autostart", 1)]
+            {
+                let mut fake = bootloader(|fake| fake.on_command = script(command, usize::MAX, outcome));
+                let error = fails(&mut fake);
+                assert_eq!((error.number(), fake.count("command 01")), (number, starts));
+                assert!(error.to_string().starts_with(&format!("{words} failed: ")), "{error}");
+                assert!(starts > 0 || fake.writes() == ["command 03"]);
+            }
         }
     }
 }
@@ -600,8 +581,7 @@ fn every_status_of_the_manual_has_its_number_and_words() {
 #[test]
 fn an_erase_that_the_device_puts_off_is_asked_for_twice() {
     for (millis, commands) in [(30, 2), (150, 1)] {
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.erase_time = Duration::from_millis(millis);
+        let mut fake = bootloader(|fake| fake.erase_time = Duration::from_millis(millis));
         steps::erase_at_once(&mut Session::new(&mut fake, node(), Timing::default()), 1).unwrap();
         assert_eq!(fake.writes(), vec!["command 03"; commands], "{millis} ms");
     }
@@ -611,22 +591,19 @@ fn an_erase_that_the_device_puts_off_is_asked_for_twice() {
 /// repeated: what keeps the device busy may be the download of somebody else.
 #[test]
 fn a_command_is_repeated_while_the_device_is_still_storing() {
-    let busy = || Outcome::AbortStatus(0x0800_0022, 0x86);
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_command = script(0x83, 3, busy());
+    let busy = Outcome::AbortStatus(0x0800_0022, 0x86);
+    let mut fake = bootloader(|fake| fake.on_command = script(0x83, 3, busy));
     assert!(run(&mut fake, FlashOptions::default()).0.is_ok());
     assert_eq!(fake.count("command 83"), 4);
 
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_command = script(0x03, 1, busy());
+    let mut fake = bootloader(|fake| fake.on_command = script(0x03, 1, busy));
     assert_eq!(fails(&mut fake).number(), 0x6000_0186);
     assert_eq!(fake.writes(), ["command 03"]);
 }
 
 #[test]
 fn an_unknown_status_and_its_detail_are_shown() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_block = script(1, 1, Outcome::Status(0xBEEF_0020));
+    let mut fake = bootloader(|fake| fake.on_block = script(1, 1, Outcome::Status(0xBEEF_0020)));
     let error = fails(&mut fake);
     assert_eq!(error.number(), 0x6000_0008);
     assert!(error.to_string().contains("detail BEEFh"), "{error}");
@@ -634,8 +611,7 @@ fn an_unknown_status_and_its_detail_are_shown() {
 
 #[test]
 fn a_block_is_repeated_as_often_as_allowed() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_block = script(2, 2, Outcome::Status(0x06));
+    let mut fake = bootloader(|fake| fake.on_block = script(2, 2, Outcome::Status(0x06)));
     let (report, events) = run(&mut fake, FlashOptions::default().repeats(2));
     assert_eq!(report.unwrap().repeats, 2);
     assert_eq!(fake.count("block 2"), 3);
@@ -643,24 +619,21 @@ fn a_block_is_repeated_as_often_as_allowed() {
     let again = Event::Retry(Retry::block(2, 2, 2, RepeatReason::Crc));
     assert!(events.contains(&again));
 
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_block = script(2, 3, Outcome::Status(0x06));
+    let mut fake = bootloader(|fake| fake.on_block = script(2, 3, Outcome::Status(0x06)));
     let error = run(&mut fake, FlashOptions::default().repeats(2)).0.unwrap_err();
     assert_eq!((error.number(), fake.count("block 2"), fake.count("block 3")), (0x6000_0003, 3, 0));
 }
 
 #[test]
 fn a_refusal_without_status_gives_the_abort_code() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_block = script(1, 1, Outcome::Abort(0x0607_0012));
+    let mut fake = bootloader(|fake| fake.on_block = script(1, 1, Outcome::Abort(0x0607_0012)));
     let error = fails(&mut fake);
     assert_eq!((error.number(), fake.count("block 1")), (0x6000_0025, 1));
     let text = error.to_string();
     assert!(text.starts_with("node 5 refuses writing block 1: abort 06070012h"), "{text}");
     assert!(error.advice().to_string().contains("--block-size"));
     // Codes that mean lost frames: the tool tries once more.
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_block = script(1, 1, Outcome::Abort(0x0504_0000));
+    let mut fake = bootloader(|fake| fake.on_block = script(1, 1, Outcome::Abort(0x0504_0000)));
     assert_eq!(run(&mut fake, FlashOptions::default()).0.unwrap().repeats, 1);
 }
 
@@ -683,8 +656,7 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
     }
     for command in [0x80, 0x03, 0x83, 0x01] {
         for outcome in [Outcome::LoseAnswer, Outcome::LoseRequest] {
-            let mut fake = Fake::new(APPLICATION);
-            fake.on_command = script(command, 1, outcome);
+            let mut fake = device(APPLICATION, |fake| fake.on_command = script(command, 1, outcome));
             let result = run(&mut fake, FlashOptions::default().trial_run(false)).0;
             // START is sent once: a program that already runs may not support it.
             let fatal = command == 0x01 && outcome == Outcome::LoseRequest;
@@ -707,15 +679,16 @@ fn a_long_erase_is_waited_for_without_flooding_the_bus() {
 
 #[test]
 fn busy_for_ever_is_given_up() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_secs(100_000);
-    let error = fails(&mut fake);
-    assert_eq!(error.number(), 0x6000_0016);
-    assert!(error.to_string().starts_with("node 5 is still busy erasing the program after 60"), "{error}");
-    fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_secs(100_000);
-    fake.deaf_while_busy = true;
-    assert_eq!(fails(&mut fake).number(), 0x6000_0013);
+    for (deaf, number, words) in [
+        (false, 0x6000_0016, "node 5 is still busy erasing the program after 60"),
+        (true, 0x6000_0013, "node 5 does not answer (erasing the program)"),
+    ] {
+        let mut fake = bootloader(|fake| fake.erase_time = Duration::from_secs(100_000));
+        fake.deaf_while_busy = deaf;
+        let error = fails(&mut fake);
+        assert_eq!(error.number(), number);
+        assert!(error.to_string().starts_with(words), "{error}");
+    }
 }
 
 /// The power is cut during the erase: this is reported after 2 s, and the update ends after 10 s.
@@ -736,17 +709,16 @@ fn silence_is_told_and_comes_to_an_end_soon() {
         // The last check takes a second, and the steps before the erase some milliseconds.
         let took = fake.now - began;
         assert!(took >= Duration::from_secs(end) && took < Duration::from_secs(end + 3), "{took:?}");
-        let told: Vec<String> = events
+        let reported: Vec<String> = events
             .iter()
             .filter(|event| matches!(event, Event::Warning(Warning::Silent { .. })))
             .map(Event::to_string)
             .collect();
         let line = format!("no answer for 2 s (erasing the program), waiting up to {end} s");
-        assert_eq!(told, [line], "once");
+        assert_eq!(reported, [line], "once");
     }
     // For a device that answers all the time nothing of this is reported.
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_secs(30);
+    let mut fake = bootloader(|fake| fake.erase_time = Duration::from_secs(30));
     let (result, events) = run(&mut fake, FlashOptions::default());
     assert!(
         result.is_ok() && !events.iter().any(|event| matches!(event, Event::Warning(Warning::Silent { .. }))),
@@ -758,8 +730,7 @@ fn silence_is_told_and_comes_to_an_end_soon() {
 /// answers and continues. It is called again soon.
 #[test]
 fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again() {
-    let mut fake = Fake::new(APPLICATION);
-    fake.erase_time = Duration::from_millis(500);
+    let mut fake = device(APPLICATION, |fake| fake.erase_time = Duration::from_millis(500));
     let mut calls = 0;
     fake.on_command = Box::new(move |command| {
         calls += u32::from(command == 0x80);
@@ -791,8 +762,7 @@ fn a_second_program_is_written_to_a_device_whose_first_one_runs() {
 
 #[test]
 fn an_application_that_does_not_go_back() {
-    let mut fake = Fake::new(APPLICATION);
-    fake.on_command = script(0x80, usize::MAX, Outcome::Ignore);
+    let mut fake = device(APPLICATION, |fake| fake.on_command = script(0x80, usize::MAX, Outcome::Ignore));
     let error = fails(&mut fake);
     assert_eq!((error.number(), fake.count("command 80")), (0x6000_0010, 3));
     assert_eq!(error.to_string(), "node 5 stays in an application (device type 00020192h)");
@@ -820,8 +790,7 @@ fn an_application_that_does_not_go_back() {
 
 #[test]
 fn a_wrong_program_crc_is_never_released() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.crc = Some(0x1234_5678);
+    let mut fake = bootloader(|fake| fake.crc = Some(0x1234_5678));
     let error = fails(&mut fake);
     assert_eq!(error.number(), 0x6000_0001);
     assert!(error.to_string().contains("CRC 12345678h, that of the file "), "{error}");
@@ -830,23 +799,21 @@ fn a_wrong_program_crc_is_never_released() {
 
 #[test]
 fn a_program_that_does_not_come_up() {
-    let fails = |fake: &mut Fake| run(fake, FlashOptions::default().trial_run(false)).0.unwrap_err();
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.starts = Some(BOOTLOADER);
-    let error = fails(&mut fake);
-    assert_eq!(error.number(), 0x6000_0014);
+    let fails = |change: &dyn Fn(&mut Fake)| {
+        let error = run(&mut bootloader(change), FlashOptions::default().trial_run(false)).0.unwrap_err();
+        (error.number(), error.to_string())
+    };
+    let (number, words) = fails(&|fake| fake.starts = Some(BOOTLOADER));
+    assert_eq!(number, 0x6000_0014);
     assert_eq!(
-        error.to_string(),
+        words,
         "the program does not start: node 5 stays in the bootloader (device type 10000000h); there is no valid \
          program to start (1F57h reads 02h)"
     );
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.starts = None;
-    let error = fails(&mut fake);
-    assert_eq!(error.to_string(), "the program does not start: node 5 does not answer");
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.on_command = script(0x01, 1, Outcome::AbortStatus(0x0800_0022, 0x02));
-    assert_eq!(fails(&mut fake).number(), 0x6000_0014);
+    let (_, words) = fails(&|fake| fake.starts = None);
+    assert_eq!(words, "the program does not start: node 5 does not answer");
+    let refused = Outcome::AbortStatus(0x0800_0022, 0x02);
+    assert_eq!(fails(&|fake| fake.on_command = script(0x01, 1, refused)).0, 0x6000_0014);
 }
 
 #[test]
@@ -870,15 +837,13 @@ fn what_others_say_on_the_bus_is_passed_over() {
 
 #[test]
 fn answers_that_come_late_do_not_stand_for_others() {
-    let mut fake = Fake::new(BOOTLOADER);
     // Each answer takes longer than the time-out: no step may count as done.
-    fake.latency = Duration::from_millis(700);
+    let slow = || bootloader(|fake| fake.latency = Duration::from_millis(700));
+    let mut fake = slow();
     assert!(run(&mut fake, FlashOptions::default()).0.is_err());
     assert_eq!(fake.count("command 83"), 0);
     // With a longer time-out the update succeeds.
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.latency = Duration::from_millis(700);
-    let timing = Timing::default().sdo(Duration::from_secs(2));
+    let (mut fake, timing) = (slow(), Timing::default().sdo(Duration::from_secs(2)));
     let mut session = Session::new(&mut fake, node(), timing);
     flash(&mut session, file(), &FlashOptions::default(), &mut |_| {}).unwrap();
 }
@@ -886,8 +851,7 @@ fn answers_that_come_late_do_not_stand_for_others() {
 #[test]
 fn cancelling_aborts_the_transfer() {
     for knows_blocks in [Blocks::Refused(0x0504_0001), Blocks::Known(5)] {
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.knows_blocks = knows_blocks;
+        let mut fake = bootloader(|fake| fake.knows_blocks = knows_blocks);
         let flag = Arc::new(AtomicBool::new(false));
         let mut session = Session::new(&mut fake, node(), Timing::default());
         session.cancel_by(flag.clone());
@@ -910,8 +874,7 @@ fn an_adapter_that_goes_away_ends_it_at_any_frame() {
     let mut fake = Fake::new(APPLICATION);
     run(&mut fake, FlashOptions::default()).0.unwrap();
     for frames in 0..fake.sent.len() {
-        let mut fake = Fake::new(APPLICATION);
-        fake.frames_left = frames;
+        let mut fake = device(APPLICATION, |fake| fake.frames_left = frames);
         let error = fails(&mut fake);
         assert_eq!(error.number(), 0x6000_0303, "{error}");
     }

@@ -280,9 +280,9 @@ impl Maker for Told {
 #[test]
 fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released() {
     let trial = FlashOptions::default();
-    let fake = |told: Told, options: &FlashOptions| {
+    let fake = |reported: Told, options: &FlashOptions| {
         let mut fake = Fake::new(BOOTLOADER);
-        fake.maker = Some(Box::new(told));
+        fake.maker = Some(Box::new(reported));
         let result = run(&mut fake, options).0;
         let commands: Vec<String> =
             fake.log.iter().filter(|entry| entry.starts_with("command")).cloned().collect();
@@ -291,7 +291,7 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
     // The identity of the test's device; no serial number on one side; another revision; a product
     // code of 0.
     let same: fn(u8) -> Option<Result<u32, u32>> = |_| None;
-    for told in [
+    for reported in [
         Told(same, None),
         Told(same, Some(7)),
         Told(|sub| (sub == 4).then_some(Ok(9)), None),
@@ -300,7 +300,7 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
         Told(|sub| (sub == 3).then_some(Ok(0x0002_0001)), None),
         Told(|sub| (sub == 2).then_some(Ok(0)), None),
     ] {
-        let (result, commands, _) = fake(told, &trial);
+        let (result, commands, _) = fake(reported, &trial);
         assert!(result.is_ok(), "{result:?}");
         assert_eq!(commands[commands.len() - 2..], ["command 83", "command 01"]);
     }
@@ -326,8 +326,8 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
             "the program on trial tells serial number 00000008h, and the bootloader of node 5 00000007h",
         ),
     ];
-    for (told, part, words) in cases {
-        let (result, commands, running) = fake(told, &trial);
+    for (reported, part, words) in cases {
+        let (result, commands, running) = fake(reported, &trial);
         let error = result.unwrap_err();
         assert!(matches!(error, Error::OtherIdentity { what, .. } if what == part), "{error}");
         assert_eq!((error.to_string().as_str(), error.number()), (words, 0x6000_0014));
