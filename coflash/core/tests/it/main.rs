@@ -11,4 +11,5 @@ mod device;
 mod file;
 mod machine;
 mod pages;
+mod tap;
 mod update;

@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use canopen::{AbortCode, Address, CobId, Frame, NodeId};
 use coboot_can::Adapter;
-use coboot_can::AdapterError;
 use coflash_core::device::info::info;
 use coflash_core::device::scan::{scan, ScanOptions};
 use coflash_core::device::{Session, Timing, Transfers};
 use coflash_core::Error;
 use embedded_can::Frame as _;
 
+use crate::tap::Tap;
 use kit::fake::{Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
 
 const NAME: Address = Address::new(0x1008, 0);
@@ -80,70 +80,30 @@ fn a_read_is_repeated_as_often_as_asked() {
     }
 }
 
-/// A host that is held up while the answer arrives.
-struct HeldUp {
-    fake: Fake,
-    /// The number of the receptions that take as long as this.
-    receptions: usize,
-    takes: Duration,
-}
-
-impl Adapter for HeldUp {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.fake.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        if timeout.is_zero() || self.receptions == 0 {
-            return self.fake.receive(timeout);
-        }
-        self.receptions -= 1;
-        self.fake.now += self.takes;
-        self.fake.receive(Duration::ZERO)
-    }
-
-    fn now(&self) -> Duration {
-        self.fake.now
-    }
-}
-
 /// The answer has come in time; it only lies after the frames of others.
 #[test]
 fn a_host_that_is_held_up_finds_the_answer_that_is_there() {
     let mut fake = Fake::new(APPLICATION);
     let heartbeat = Frame::of(CobId::new(0x706).unwrap(), &[5]);
     fake.noise = vec![heartbeat; 20];
-    let mut held_up = HeldUp { fake, receptions: 100, takes: Duration::from_secs(2) };
+    // It is held up in each of so many receptions.
+    let mut receptions = 100;
+    let mut held_up = Tap::receiving(fake, |fake, timeout| {
+        if timeout.is_zero() || receptions == 0 {
+            return fake.receive(timeout);
+        }
+        receptions -= 1;
+        fake.now += Duration::from_secs(2);
+        fake.receive(Duration::ZERO)
+    });
     assert_eq!(session(&mut held_up).read(NAME).unwrap(), b"a device with a long name");
-    assert_eq!(held_up.fake.count("read 1008/0"), 1);
-}
-
-/// A device whose SDO answers have this many bytes.
-struct Short(Fake, usize);
-
-impl Adapter for Short {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.0.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        let frame = self.0.receive(timeout)?;
-        let answers = CobId::new(0x580 + u16::from(NODE));
-        Ok(frame.map(|frame| match frame.cob_id() {
-            id if id == answers => Frame::of(id.unwrap(), &frame.data()[..self.1]),
-            _ => frame,
-        }))
-    }
-
-    fn now(&self) -> Duration {
-        self.0.now
-    }
+    assert_eq!(held_up.of.count("read 1008/0"), 1);
 }
 
 #[test]
 fn a_node_with_short_answers_is_not_one_without() {
     for len in [0, 4, 5, 7] {
-        let mut short = Short(Fake::new(APPLICATION), len);
+        let mut short = Tap::shortened(Fake::new(APPLICATION), len);
         let error = info(&mut session(&mut short)).unwrap_err();
         assert!(matches!(error, Error::ShortAnswer { len: found, .. } if found == len), "{error}");
         let words = format!("node 5 answers, but with frames of {len} bytes where SDO has 8");

@@ -2,11 +2,9 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
-use coboot_can::AdapterError;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{
     plan, run, Bad, DeviceFault, Good, Outcome, Package, Plan, PlanError, RunOptions, Todo,
@@ -14,9 +12,9 @@ use coflash_core::machine::{
 use coflash_core::update::many::ManyOptions;
 use coflash_core::update::{DeviceState, Event, FlashOptions};
 use coflash_core::Error;
-use embedded_can::Frame as _;
 
 use super::packed;
+use crate::tap::Tap;
 use kit::fake::{Bus, Fake, Maker, APPLICATION, BOOTLOADER};
 
 /// The CRC in the last block of `plain-400.blk`, as expected.py computed it (bytes 875 to 878).
@@ -349,36 +347,11 @@ fn no_plan_is_made_while_another_tool_talks_to_a_node() {
     assert_eq!(planned(&mut bus, &package).updates(), 2);
 }
 
-/// A device whose answers are too short.
-struct Short(Bus);
-
-impl Adapter for Short {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.0.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        let frame = self.0.receive(timeout)?;
-        let is_its = |frame: &Frame| frame.cob_id() == CobId::new(0x585);
-        Ok(frame.map(|frame| {
-            if is_its(&frame) {
-                Frame::of(CobId::new(0x585).unwrap(), &frame.data()[..4])
-            } else {
-                frame
-            }
-        }))
-    }
-
-    fn now(&self) -> Duration {
-        self.0.now()
-    }
-}
-
 /// It is on the bus, and nobody looks for its plug.
 #[test]
 fn a_device_that_answers_wrongly_is_not_absent() {
     let package = package(&[("drive", r#""nodes": [5, 6, 7]"#)]);
-    let mut bus = Short(Bus(vec![device(5, 1234), device(6, 1234)]));
+    let mut bus = Tap::shortened(Bus(vec![device(5, 1234), device(6, 1234)]), 4);
     let plan = planned(&mut bus, &package);
     assert_eq!(steps(&plan), [(6, "drive", "update")]);
     let outcomes = words(&carried_out(&mut bus, &package, &plan));
@@ -415,30 +388,6 @@ fn a_device_that_is_gone_costs_the_others_nothing() {
     assert_eq!(outcomes[2], (Some(5), 1, "6000040Dh".to_owned()));
 }
 
-/// A bus on which the user cancels at a block of a download.
-struct Interrupted<'a> {
-    bus: &'a mut Bus,
-    flag: Arc<AtomicBool>,
-    blocks: usize,
-}
-
-impl Adapter for Interrupted<'_> {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        if self.bus.0.iter().map(|fake| fake.blocks.len()).sum::<usize>() >= self.blocks {
-            self.flag.store(true, Ordering::Relaxed);
-        }
-        self.bus.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        self.bus.receive(timeout)
-    }
-
-    fn now(&self) -> Duration {
-        self.bus.now()
-    }
-}
-
 /// Cancelled in the first of three devices: the outcome of each is kept, and the next run does the rest.
 #[test]
 fn an_interrupted_run_is_continued_by_the_next() {
@@ -450,8 +399,12 @@ fn an_interrupted_run_is_continued_by_the_next() {
     let plan = planned(&mut bus, &package);
     let flag: Arc<AtomicBool> = Arc::default();
     let options = RunOptions::default().many(ManyOptions::default().cancelled(flag.clone()));
-    let mut interrupted = Interrupted { bus: &mut bus, flag, blocks: 2 };
+    let mut interrupted = Tap::sending(bus, |bus, _| {
+        let blocks: usize = bus.0.iter().map(|fake| fake.blocks.len()).sum();
+        flag.fetch_or(blocks >= 2, Ordering::Relaxed);
+    });
     let outcomes = run(&mut interrupted, &package, &plan, &options, &|_, _, _| {});
+    let mut bus = interrupted.of;
     assert_eq!(outcomes.len(), 3);
     for (outcome, state) in
         outcomes.iter().zip([DeviceState::Erased, DeviceState::Untouched, DeviceState::Untouched])

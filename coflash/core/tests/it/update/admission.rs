@@ -1,12 +1,13 @@
 //! Refusals before the device is changed, in every dialect: files that cannot be a program, and
 //! programs for another device or for another place in flash.
 
+use super::update;
 use canopen::NodeId;
 use coflash_core::device::info::info;
 use coflash_core::device::{Dialect, Error, Session, Timing};
 use coflash_core::file::convert::{program_of, Label as Told, Options};
 use coflash_core::file::{raw, Firmware, Program};
-use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
+use coflash_core::update::{DeviceState, Event, FlashOptions, Password, Report};
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const START: u32 = 0x0801_0000;
@@ -38,10 +39,7 @@ fn file(bytes: &[u8], at: u32, label: Told) -> Program {
 }
 
 fn run(fake: &mut Fake, file: &Program, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, file, &options, &mut |event| events.push(event));
-    (result, events)
+    update(fake, file, &options)
 }
 
 /// The update is refused, and nothing was written: not even the call to the bootloader.

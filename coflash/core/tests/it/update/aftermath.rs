@@ -3,29 +3,23 @@
 
 use std::time::Duration;
 
-use canopen::{CobId, Frame, NodeId};
+use canopen::{CobId, Frame};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::error::Intruder;
-use coflash_core::device::{Dialect, Session, Timing};
-use coflash_core::file::block_file;
+use coflash_core::device::Dialect;
 use coflash_core::update::event::Phase;
-use coflash_core::update::{
-    flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report,
-};
+use coflash_core::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
 
+use super::{file, update};
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const CLEAR: u8 = 0x03;
 const CALL: u8 = 0x80;
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = block_file::read(data!("identity-110.blk")).unwrap();
-    let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, &file, options, &mut |event| events.push(event));
-    (result, events)
+    update(adapter, file(), options)
 }
 
 fn left(running: u32, change: &dyn Fn(&mut Fake), options: FlashOptions) -> DeviceAfterUpdate {
@@ -263,7 +257,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     let written = |fake: &mut Fake| {
         fake.starts = None;
         fake.on_block = Box::new(|_| Outcome::Ignore);
-        fake.crc = Some(block_file::read(data!("identity-110.blk")).unwrap().crc());
+        fake.crc = Some(file().crc());
     };
     let raw = left(BOOTLOADER, &written, dialect(Dialect::Raw));
     assert_eq!((raw.state, raw.answer), (DeviceState::Written, DeviceAnswer::Silent));

@@ -9,7 +9,7 @@ use coflash_core::device::{recognise, Dialect, Doing, Session, Timing, Transfers
 use coflash_core::file::block_file;
 use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::ihex;
-use coflash_core::file::{Program, Target};
+use coflash_core::file::Target;
 use coflash_core::update::dialect::{self, read_locked};
 use coflash_core::update::event::{Note, Phase};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
@@ -17,16 +17,16 @@ use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Re
 use coflash_core::Error;
 use embedded_can::Frame as _;
 
+<<<<<<< HEAD
 use super::left;
 use kit::fake::lift::{Kept, Lift, LIFT, NOT_NOW, NO_OBJECT, PHRASE, RANGE};
+=======
+use super::{file, left};
+>>>>>>> 43ae2e16 (Tests of updates share one set-up, and one adapter with a test in between)
 use kit::fake::{Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// "BOOT" (ESAcademy), and what older lift bootloaders have.
 const BOOT: u32 = 0x424F_4F54;
-
-fn file() -> Program {
-    block_file::read(data!("identity-110.blk")).unwrap()
-}
 
 fn node(id: u8) -> NodeId {
     NodeId::new(id).unwrap()

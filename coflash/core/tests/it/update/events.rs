@@ -2,26 +2,22 @@
 
 use std::time::Duration;
 
+use super::{file, node};
 use canopen::{AbortCode, NodeId};
 use coflash_core::device::{DeviceType, Dialect, Session, Timing};
 use coflash_core::file::checksum::Checksum;
-use coflash_core::file::{block_file, Target};
+use coflash_core::file::Target;
 use coflash_core::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
 use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
 use kit::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use serde_json::{json, Value};
 
-fn node() -> NodeId {
-    NodeId::new(NODE).unwrap()
-}
-
 /// The lines of an update of this device.
 fn lines(fake: &mut Fake, options: &FlashOptions) -> Vec<Value> {
-    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let mut lines = Vec::new();
     let mut session = Session::new(fake, node(), Timing::default());
-    let _ = flash(&mut session, &file, options, &mut |event| {
+    let _ = flash(&mut session, file(), options, &mut |event| {
         let line = serde_json::to_string(&event.line(node())).unwrap();
         assert!(!line.contains('\n'), "{line}");
         lines.push(serde_json::from_str(&line).unwrap());

@@ -14,6 +14,7 @@ use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Rep
 use coflash_core::Error;
 
 use super::left;
+use super::{file, update};
 use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER, NODE};
 
 const fn ms(time: u64) -> Duration {
@@ -92,19 +93,12 @@ impl Adapter for Beside {
     }
 }
 
-fn program() -> Payload {
-    block_file::read(data!("identity-110.blk")).unwrap().into()
-}
-
 fn run(adapter: &mut dyn Adapter) -> (Result<Report, Error>, Vec<Event>) {
-    run_with(adapter, &program())
+    run_with(adapter, &file().into())
 }
 
 fn run_with(adapter: &mut dyn Adapter, file: &Payload) -> (Result<Report, Error>, Vec<Event>) {
-    let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, file, &FlashOptions::default(), &mut |event| events.push(event));
-    (result, events)
+    update(adapter, file, &FlashOptions::default())
 }
 
 /// Whenever the master begins after a boot-up, its reads end by themselves: twenty updates each, of
@@ -134,7 +128,7 @@ fn a_master_that_starts_the_node_ends_no_update() {
 /// was called back starts again, and the tool says why. A new bootloader is no exception.
 #[test]
 fn who_goes_on_asking_after_the_call_back_is_told_and_the_program_starts_again() {
-    let (program, new) = (program(), super::renew::new());
+    let (program, new) = (Payload::from(file()), super::renew::new());
     for (waits, pause, file) in
         [(0, 20, &program), (100, 20, &program), (0, 250, &program), (250, 250, &program), (0, 20, &new)]
     {
@@ -158,7 +152,7 @@ fn who_goes_on_asking_after_the_call_back_is_told_and_the_program_starts_again()
 /// Another tool that commands the bootloader has the device: it is left to it.
 #[test]
 fn who_commands_the_bootloader_has_the_device() {
-    let (program, new) = (program(), super::renew::new());
+    let (program, new) = (Payload::from(file()), super::renew::new());
     for (waits, file) in [(0, &program), (100, &program), (250, &program), (100, &new)] {
         let mut fake = Fake::new(APPLICATION);
         fake.restart_time = ms(50);

@@ -7,12 +7,13 @@ use std::time::Duration;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
-use coflash_core::device::{Dialect, Session, Timing};
-use coflash_core::file::block_file;
+use coflash_core::device::Dialect;
 use coflash_core::update::event::{Note, Warning};
-use coflash_core::update::{flash, Event, FlashOptions, Password, Report};
+use coflash_core::update::{Event, FlashOptions, Password, Report};
 use coflash_core::Error;
 
+use super::{file, update};
+use crate::tap::Tap;
 use kit::fake::{Deed, Fake, Maker, APPLICATION, NODE};
 
 const LIFT: u32 = 0xFE00_01A1;
@@ -59,15 +60,7 @@ fn lift() -> Fake {
 }
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = block_file::read(data!("plain-400.blk")).unwrap();
-    let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, &file, options, &mut |event| {
-        if !matches!(event, Event::Progress { .. }) {
-            events.push(event);
-        }
-    });
-    (result, events)
+    update(adapter, file(), options)
 }
 
 /// Whether an event begins with this text.
@@ -226,31 +219,19 @@ fn what_a_lift_tells_of_itself_is_shown_before_anything_is_done_to_it() {
 /// A node 126 without SDO that sends a heartbeat every second is another device in its bootloader.
 #[test]
 fn a_node_126_that_only_sends_heartbeats_is_noticed() {
-    struct Beating(Fake, Duration);
-    impl Adapter for Beating {
-        fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-            self.0.send(frame)
-        }
-
-        fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-            if self.1 <= self.0.now + timeout {
-                self.0.now = self.0.now.max(self.1);
-                self.1 += Duration::from_secs(1);
-                return Ok(Some(frame(0x77E, &[0x7F])));
-            }
-            self.0.receive(timeout)
-        }
-
-        fn now(&self) -> Duration {
-            self.0.now
-        }
-    }
     let fake = lift();
-    let first = fake.now + Duration::from_millis(990);
-    let mut bus = Beating(fake, first);
+    let mut next = fake.now + Duration::from_millis(990);
+    let mut bus = Tap::receiving(fake, |fake, timeout| {
+        if next <= fake.now + timeout {
+            fake.now = fake.now.max(next);
+            next += Duration::from_secs(1);
+            return Ok(Some(frame(0x77E, &[0x7F])));
+        }
+        fake.receive(timeout)
+    });
     let (result, _) = run(&mut bus, &options());
     assert!(matches!(result, Err(Error::Occupied { node }) if node.get() == 126), "{result:?}");
-    assert!(bus.0.writes().is_empty(), "{:?}", bus.0.writes());
+    assert!(bus.of.writes().is_empty(), "{:?}", bus.of.writes());
     let advice = result.unwrap_err().advice().to_string();
     assert!(advice.contains("node 126"), "{advice}");
 }

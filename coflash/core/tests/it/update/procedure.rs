@@ -4,8 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::left;
-use canopen::{CobId, Frame, NodeId};
+use super::{file, left, node, update};
+use canopen::{CobId, Frame};
 use coboot_can::Adapter;
 use coflash_core::device::info::info;
 use coflash_core::device::{Session, Timing, Transfers};
@@ -17,25 +17,14 @@ use coflash_core::update::event::{Phase, RepeatReason, Retry, Warning};
 use coflash_core::update::{flash, steps, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
 use embedded_can::{Frame as _, StandardId};
-use kit::fake::{crc16, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{crc16, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER};
 use proptest::prelude::*;
-
-fn file() -> Program {
-    block_file::read(data!("identity-110.blk")).unwrap()
-}
 
 /// Five blocks: 0, 1 to 4 (three of code, one of text and data), -1.
 const BLOCKS: usize = 6;
 
-fn node() -> NodeId {
-    NodeId::new(NODE).unwrap()
-}
-
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let mut events = Vec::new();
-    let mut session = Session::new(fake, node(), Timing::default());
-    let result = flash(&mut session, file(), &options, &mut |event| events.push(event));
-    (result, events)
+    update(fake, file(), &options)
 }
 
 fn fails(fake: &mut Fake) -> Error {

@@ -15,6 +15,7 @@ use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Ren
 use coflash_core::Error;
 use shared_abi::ram_image::Version;
 
+use super::update;
 use kit::fake::renewal::*;
 use kit::fake::{Bus, Fake, APPLICATION, BOOTLOADER, NODE};
 
@@ -24,13 +25,8 @@ pub fn new() -> Payload {
 }
 
 fn run_with(fake: &mut Fake, options: &FlashOptions) -> (Result<Renewal, Error>, Vec<Event>) {
-    let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, new(), options, &mut |event| {
-        if !matches!(event, Event::Progress { .. } | Event::Done(_)) {
-            events.push(event);
-        }
-    });
+    let (result, mut events) = update(fake, new(), options);
+    events.retain(|event| !matches!(event, Event::Progress { .. } | Event::Done(_)));
     (result.map(|report| report.renewal.unwrap()), events)
 }
 

@@ -10,48 +10,31 @@ use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::error::{Error, IdentityPart};
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 
+use super::{file, node, update};
+use crate::tap::Tap;
 use kit::fake::{Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = block_file::read(data!("plain-400.blk")).unwrap();
-    let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
-    let mut events = Vec::new();
-    let result = flash(&mut session, &file, options, &mut |event| events.push(event));
-    (result, events)
+    update(adapter, file(), options)
 }
 
 /// A device that is switched on at this time, with a program that starts 300 ms later unless a
 /// client sends a request.
-struct Late {
-    fake: Fake,
-    on: Duration,
-    asked: bool,
-}
-
-impl Adapter for Late {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        assert!(self.fake.now < self.on + Duration::from_secs(60), "it was not caught");
-        let until = self.on + Duration::from_millis(300);
-        self.asked |= (self.on..until).contains(&self.fake.now) && frame.cob_id().unwrap().get() == 0x605;
-        self.fake.running = match () {
-            () if self.fake.now < self.on => None,
-            () if self.asked || self.fake.now < until => Some(BOOTLOADER),
+fn late(fake: Fake, on: Duration) -> Tap<'static, Fake> {
+    let mut asked = false;
+    Tap::sending(fake, move |fake, frame| {
+        assert!(fake.now < on + Duration::from_secs(60), "it was not caught");
+        let until = on + Duration::from_millis(300);
+        asked |= (on..until).contains(&fake.now) && frame.cob_id().unwrap().get() == 0x605;
+        fake.running = match () {
+            () if fake.now < on => None,
+            () if asked || fake.now < until => Some(BOOTLOADER),
             () => Some(0xDEAD),
         };
-        self.fake.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        self.fake.receive(timeout)
-    }
-
-    fn now(&self) -> Duration {
-        self.fake.now
-    }
+    })
 }
 
 #[test]
@@ -59,7 +42,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
     for millis in [0, 50, 999, 60_000, 60_037] {
         let fake = Fake::new(BOOTLOADER);
         let on = fake.now + Duration::from_millis(millis);
-        let mut late = Late { fake, on, asked: false };
+        let mut late = late(fake, on);
         let options = FlashOptions::default().wait(true).start(false);
         let (result, events) = run(&mut late, &options);
         assert!(result.is_ok(), "{millis}: {result:?}");
@@ -70,7 +53,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
     }
     let fake = Fake::new(BOOTLOADER);
     let on = fake.now + Duration::from_secs(60);
-    let mut late = Late { fake, on, asked: false };
+    let mut late = late(fake, on);
     assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
 }
 
@@ -80,12 +63,12 @@ fn a_device_that_is_switched_on_is_caught() {
     for (millis, within) in [(0, None), (50, None), (60_037, None), (59_000, Some(Duration::from_secs(60)))] {
         let fake = Fake::new(BOOTLOADER);
         let on = fake.now + Duration::from_millis(millis);
-        let mut late = Late { fake, on, asked: false };
-        let mut session = Session::new(&mut late, NodeId::new(NODE).unwrap(), Timing::default());
+        let mut late = late(fake, on);
+        let mut session = Session::new(&mut late, node(), Timing::default());
         let mut events = Vec::new();
         let options = CatchOptions::default().within(within);
         let caught = catch(&mut session, &options, &mut |event| events.push(event)).unwrap();
-        assert_eq!(caught.node, NodeId::new(NODE));
+        assert_eq!(caught.node, Some(node()));
         assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
         let searching =
             events.iter().filter(|event| matches!(event, Event::Phase(Phase::Searching { .. }))).count();
@@ -93,12 +76,12 @@ fn a_device_that_is_switched_on_is_caught() {
         let took = session.now().saturating_sub(on);
         assert!(took < Duration::from_millis(300), "{took:?}");
         // Requests that were given up are aborted.
-        assert!(late.fake.writes().iter().all(|entry| entry.starts_with("abort ")), "{:?}", late.fake.log);
+        assert!(late.of.writes().iter().all(|entry| entry.starts_with("abort ")), "{:?}", late.of.log);
     }
     let fake = Fake::new(BOOTLOADER);
     let (from, on) = (fake.now, fake.now + Duration::from_secs(59));
-    let mut late = Late { fake, on, asked: false };
-    let mut session = Session::new(&mut late, NodeId::new(NODE).unwrap(), Timing::default());
+    let mut late = late(fake, on);
+    let mut session = Session::new(&mut late, node(), Timing::default());
     let options = CatchOptions::default().within(Some(Duration::from_secs(30)));
     assert!(matches!(catch(&mut session, &options, &mut |_| {}), Err(Error::NoAnswer { .. })));
     let took = session.now() - from;
@@ -118,13 +101,13 @@ fn an_application_that_answers_is_called_back_until_it_goes() {
                 Outcome::Accept
             }
         });
-        let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
+        let mut session = Session::new(&mut fake, node(), Timing::default());
         let caught = catch(&mut session, &CatchOptions::default().within(within), &mut |_| {});
         (caught, fake.writes().len())
     };
     for outcome in [Outcome::Ignore, Outcome::Abort(0x0800_0022)] {
         let (result, calls) = caught(outcome, 5, None);
-        assert_eq!((result.unwrap().node, calls), (NodeId::new(NODE), 6));
+        assert_eq!((result.unwrap().node, calls), (Some(node()), 6));
         let (result, _) = caught(outcome, usize::MAX, Some(Duration::from_secs(20)));
         assert!(matches!(result, Err(Error::NoBootloader { .. })), "{result:?}");
     }
@@ -195,7 +178,7 @@ fn whoever_comes_up_is_caught_under_whatever_node_id() {
         let options = CatchOptions::default().any(true).within(Some(Duration::from_secs(10)));
         let caught = catch(&mut session, &options, &mut |_| {});
         match kind {
-            Kind::Bootloader => assert_eq!(caught.unwrap().node, NodeId::new(NODE)),
+            Kind::Bootloader => assert_eq!(caught.unwrap().node, Some(node())),
             Kind::WithoutNodeId => assert_eq!(caught.unwrap().node, None),
             // It may be another device than the expected one: it is not changed.
             Kind::Application => assert!(matches!(caught, Err(Error::NoAnswer { .. })), "{caught:?}"),
@@ -231,34 +214,21 @@ fn an_application_that_stays_is_asked_until_it_goes() {
 
 #[test]
 fn the_user_gives_up() {
-    struct GivesUp(Fake, Duration, Arc<AtomicBool>);
-    impl Adapter for GivesUp {
-        fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-            self.2.fetch_or(self.0.now >= self.1, Ordering::Relaxed);
-            self.0.send(frame)
-        }
-
-        fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-            self.0.receive(timeout)
-        }
-
-        fn now(&self) -> Duration {
-            self.0.now
-        }
-    }
     for running in [None, Some(APPLICATION)] {
         let mut fake = Fake::new(APPLICATION);
         fake.running = running;
         fake.on_command = Box::new(|_| Outcome::Ignore);
         let (end, flag) = (fake.now + Duration::from_secs(120), Arc::new(AtomicBool::new(false)));
-        let mut bus = GivesUp(fake, end, flag.clone());
-        let file = block_file::read(data!("plain-400.blk")).unwrap();
-        let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
+        let sees = flag.clone();
+        let mut bus = Tap::sending(fake, |fake, _| {
+            sees.fetch_or(fake.now >= end, Ordering::Relaxed);
+        });
+        let mut session = Session::new(&mut bus, node(), Timing::default());
         session.cancel_by(flag);
         let options = FlashOptions::default().wait(true);
-        let result = flash(&mut session, &file, &options, &mut |_| {});
+        let result = flash(&mut session, file(), &options, &mut |_| {});
         assert!(matches!(result, Err(Error::Cancelled)), "{result:?}");
-        assert!(bus.0.now < end + Duration::from_secs(1));
+        assert!(bus.of.now < end + Duration::from_secs(1));
     }
 }
 

@@ -3,25 +3,22 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::left;
+use super::{file, left, node, update};
 use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::file::block_file;
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
-use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER};
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {
-    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let began = fake.now;
-    let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
-    let result = flash(&mut session, &file, &options, &mut |_| {});
+    let (result, _) = update(fake, file(), &options);
     (result, fake.now - began)
 }
 
@@ -128,10 +125,7 @@ fn a_program_that_falls_silent_in_its_watch_is_told() {
     let silent = Some(End::Reset { after: Duration::from_millis(400), into: None });
     for (ends, released) in [(vec![silent], false), (vec![None, silent], true)] {
         let mut fake = device(&ends, Some([2, 0, 0]));
-        let mut events = Vec::new();
-        let file = block_file::read(data!("identity-110.blk")).unwrap();
-        let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
-        let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
+        let (result, events) = update(&mut fake, file(), &FlashOptions::default());
         let error = result.unwrap_err();
         let text = text(&error);
         assert_eq!(error.number(), 0x6000_0014, "{text}");
@@ -158,10 +152,7 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
     for frames in start + 1..=release {
         let mut fake = device(&[], None);
         fake.frames_left = frames;
-        let mut events = Vec::new();
-        let file = block_file::read(data!("identity-110.blk")).unwrap();
-        let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
-        let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
+        let (result, events) = update(&mut fake, file(), &FlashOptions::default());
         assert_eq!(result.unwrap_err().number(), 0x6000_0303, "{frames}");
         let Some(Event::Done(done)) = events.last() else { panic!("{events:?}") };
         assert_eq!((done.left.state, done.left.answer), (DeviceState::Unreleased, DeviceAnswer::NotAsked));
@@ -169,7 +160,7 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
 }
 
 fn many(bus: &mut Bus, nodes: &[u8]) -> Vec<Result<Report, (String, DeviceState)>> {
-    let file = Arc::new(block_file::read(data!("identity-110.blk")).unwrap());
+    let file = Arc::new(file());
     let job = |node: &u8| Job::new(NodeId::new(*node).unwrap(), file.clone(), FlashOptions::default());
     let jobs: Vec<Job> = nodes.iter().map(job).collect();
     let results = flash_many(bus, &jobs, &ManyOptions::default(), &|_, _| {});
@@ -308,10 +299,9 @@ impl Gateway for Through {
 #[test]
 fn boot_up_messages_of_a_gateway_count_as_those_of_a_bus() {
     let through = |fake: Fake| {
-        let file = block_file::read(data!("identity-110.blk")).unwrap();
         let mut gateway = Through(fake);
-        let mut session = Session::through(&mut gateway, NodeId::new(NODE).unwrap(), Timing::default());
-        text(&flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap_err())
+        let mut session = Session::through(&mut gateway, node(), Timing::default());
+        text(&flash(&mut session, file(), &FlashOptions::default(), &mut |_| {}).unwrap_err())
     };
     let back = through(device(&[None, reset(400, APPLICATION)], None));
     assert!(back.contains("it ran for 400 ms and was reset by itself or by a watchdog"), "{back}");
