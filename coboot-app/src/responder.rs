@@ -340,13 +340,13 @@ impl Responder {
             return Err(Abort::READ_ONLY);
         }
         const EXPEDITED: u8 = 1 << 1;
-        const SIZE_TOLD: u8 = 1 << 0;
+        const SIZE_INDICATED: u8 = 1 << 0;
         if command & EXPEDITED == 0 {
             // Its data would come in segments.
             return Err(Abort::COMMAND);
         }
         // If the client does not give the size, the size of the object counts.
-        let len = if command & SIZE_TOLD == 0 { own_len } else { 4 - usize::from(command >> 2 & 3) };
+        let len = if command & SIZE_INDICATED == 0 { own_len } else { 4 - usize::from(command >> 2 & 3) };
         let data = &data[..len];
         if index == PROGRAM_CONTROL {
             if self.control.write(sub, data, true, now, services)? == Reply::Withhold {

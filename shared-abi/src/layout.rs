@@ -116,166 +116,145 @@ impl Layout {
     /// # Errors
     /// The broken rule.
     pub const fn check(&self) -> Result<(), &'static str> {
-        const REGION: &str = "a region is empty, or reaches over the end of the address space";
-        let fixed = [
-            self.bootloader,
-            self.parameters[0],
-            self.parameters[1],
-            self.ram,
-            self.handoff,
-            self.warm_start,
-        ];
-        let mut f = 0;
-        while f < fixed.len() {
-            if !fixed[f].is_possible() {
-                return Err(REGION);
-            }
-            f += 1;
+        if !self.has_possible_regions() {
+            return Err("a region is empty, or reaches over the end of the address space");
         }
-        let optional = [self.home, self.data, self.staging];
-        let mut o = 0;
-        while o < optional.len() {
-            if let Some(region) = optional[o] {
-                if !region.is_possible() {
-                    return Err(REGION);
-                }
-            }
-            o += 1;
+        if let Err(rule) = self.check_bootloader() {
+            return Err(rule);
         }
-        let mut q = 0;
-        while q < self.programs.len() {
-            if !self.programs[q].is_possible() {
-                return Err(REGION);
-            }
-            q += 1;
+        if let Err(rule) = self.check_programs() {
+            return Err(rule);
         }
-        let chip = self.chip;
-        if self.bootloader.base != chip.flash.base {
-            return Err("the bootloader must start at the base of the flash, where the core fetches its vectors after a reset");
+        if let Err(rule) = self.check_staging() {
+            return Err(rule);
         }
-        if !chip.is_whole_sectors(&self.bootloader) {
-            return Err("the bootloader must end at a sector border");
-        }
-        if self.bootloader.size <= KEY_BLOCK_SIZE {
-            return Err("the bootloader has no room beside its key block");
-        }
-        if self.callgate_offset < CORE_VECTORS_SIZE {
-            return Err("the callgate overlaps the bootloader's vector table");
-        }
-        if self.callgate_offset >= self.bootloader.size
-            || !self.bootloader.contains(self.bootloader.base + self.callgate_offset, callgate::TABLE_SIZE)
-        {
-            return Err("the callgate lies outside the bootloader");
-        }
-        let mut i = 0;
-        while i < 2 {
-            let parameters = &self.parameters[i];
-            if !chip.is_whole_sectors(parameters) {
-                return Err("a parameter region must start and end at sector borders");
-            }
-            if parameters.overlaps(&self.bootloader) {
-                return Err("a parameter region overlaps the bootloader");
-            }
-            i += 1;
-        }
-        if self.parameters[0].overlaps(&self.parameters[1]) {
-            return Err("the two parameter regions overlap");
+        self.check_ram()
+    }
+
+    const fn has_possible_regions(&self) -> bool {
+        let [a, b] = self.parameters;
+        are_possible(&[self.bootloader, a, b, self.ram, self.handoff, self.warm_start])
+            && are_possible(self.home.as_slice())
+            && are_possible(self.data.as_slice())
+            && are_possible(self.staging.as_slice())
+            && are_possible(self.programs)
+    }
+
+    /// The rules of all flash but that of the programs.
+    const fn check_bootloader(&self) -> Result<(), &'static str> {
+        let (chip, bootloader, [a, b]) = (self.chip, &self.bootloader, &self.parameters);
+        let offset = self.callgate_offset;
+        let has_callgate =
+            offset < bootloader.size && bootloader.contains(bootloader.base + offset, callgate::TABLE_SIZE);
+        let are_whole = chip.is_whole_sectors(a) && chip.is_whole_sectors(b);
+        let broken = first_broken(&[
+            (
+                bootloader.base != chip.flash.base,
+                "the bootloader must start at the base of the flash, where the core fetches its vectors after a reset",
+            ),
+            (!chip.is_whole_sectors(bootloader), "the bootloader must end at a sector border"),
+            (bootloader.size <= KEY_BLOCK_SIZE, "the bootloader has no room beside its key block"),
+            (offset < CORE_VECTORS_SIZE, "the callgate overlaps the bootloader's vector table"),
+            (!has_callgate, "the callgate lies outside the bootloader"),
+            (!are_whole, "a parameter region must start and end at sector borders"),
+            (bootloader.overlaps(a) || bootloader.overlaps(b), "a parameter region overlaps the bootloader"),
+            (a.overlaps(b), "the two parameter regions overlap"),
+        ]);
+        if broken.is_err() {
+            return broken;
         }
         if let Some(home) = &self.home {
-            if !chip.is_whole_sectors(home) {
-                return Err("the home of the RAM image must start and end at sector borders");
-            }
-            if home.overlaps(&self.bootloader) {
-                return Err("the home of the RAM image overlaps the bootloader");
-            }
-            if home.overlaps(&self.parameters[0]) || home.overlaps(&self.parameters[1]) {
-                return Err("the home of the RAM image overlaps a parameter region");
-            }
-        }
-        if let Some(data) = &self.data {
-            if !chip.is_whole_sectors(data) {
-                return Err("the data region must start and end at sector borders");
-            }
-            if data.overlaps(&self.bootloader) || overlaps_optional(data, &self.home) {
-                return Err("the data region overlaps the bootloader");
-            }
-            if data.overlaps(&self.parameters[0]) || data.overlaps(&self.parameters[1]) {
-                return Err("the data region overlaps a parameter region");
+            let broken = first_broken(&[
+                (
+                    !chip.is_whole_sectors(home),
+                    "the home of the RAM image must start and end at sector borders",
+                ),
+                (home.overlaps(bootloader), "the home of the RAM image overlaps the bootloader"),
+                (
+                    home.overlaps(a) || home.overlaps(b),
+                    "the home of the RAM image overlaps a parameter region",
+                ),
+            ]);
+            if broken.is_err() {
+                return broken;
             }
         }
+        let Some(data) = &self.data else { return Ok(()) };
+        first_broken(&[
+            (!chip.is_whole_sectors(data), "the data region must start and end at sector borders"),
+            (self.is_in_bootloader(data), "the data region overlaps the bootloader"),
+            (data.overlaps(a) || data.overlaps(b), "the data region overlaps a parameter region"),
+        ])
+    }
+
+    const fn check_programs(&self) -> Result<(), &'static str> {
+        let (chip, [a, b]) = (self.chip, &self.parameters);
         if self.programs.is_empty() || self.programs.len() > 254 {
             return Err("there must be 1 to 254 programs (sub-indices 1 to 254 of 1F50h)");
         }
         let mut p = 0;
         while p < self.programs.len() {
             let program = &self.programs[p];
-            if !chip.is_whole_sectors(program) {
-                return Err("a program must start and end at sector borders");
-            }
-            if !program.base.is_multiple_of(chip.vector_table_alignment()) {
-                return Err("a program's vector table is not aligned as VTOR demands");
-            }
-            if program.overlaps(&self.bootloader) || overlaps_optional(program, &self.home) {
-                return Err("a program overlaps the bootloader");
-            }
-            if overlaps_optional(program, &self.data) {
-                return Err("a program overlaps the data region");
-            }
-            if program.overlaps(&self.parameters[0]) || program.overlaps(&self.parameters[1]) {
-                return Err("a program overlaps a parameter region");
-            }
-            let mut q = 0;
-            while q < p {
-                if program.overlaps(&self.programs[q]) {
-                    return Err("two programs overlap");
-                }
-                q += 1;
+            let is_aligned = program.base.is_multiple_of(chip.vector_table_alignment());
+            let broken = first_broken(&[
+                (!chip.is_whole_sectors(program), "a program must start and end at sector borders"),
+                (!is_aligned, "a program's vector table is not aligned as VTOR demands"),
+                (self.is_in_bootloader(program), "a program overlaps the bootloader"),
+                (overlaps_one(program, self.data.as_slice()), "a program overlaps the data region"),
+                (program.overlaps(a) || program.overlaps(b), "a program overlaps a parameter region"),
+                (overlaps_one(program, self.programs.split_at(p).0), "two programs overlap"),
+            ]);
+            if broken.is_err() {
+                return broken;
             }
             p += 1;
         }
-        if let Some(staging) = &self.staging {
-            if self.home.is_none() {
-                return Err("a staging region needs a home of the RAM image, which the compact map has not");
-            }
-            let last = &self.programs[self.programs.len() - 1];
-            if !chip.is_whole_sectors(staging)
-                || staging.end() != last.end()
-                || staging.base <= last.base
-                || !is_one_sector(chip, staging)
-            {
-                return Err(
-                    "the staging region must be the last sector of the last program, and not its only one",
-                );
-            }
-        }
-        if !chip.sram.contains(self.ram.base, self.ram.size) {
-            return Err("the RAM of the images lies outside the chip's SRAM");
-        }
-        if !self.ram.size.is_multiple_of(8) {
-            return Err("the initial stack pointer must be a multiple of 8 (AAPCS)");
-        }
-        if self.ram.overlaps(&self.handoff) || self.ram.overlaps(&self.warm_start) {
-            return Err("the handoff or the warm-start cell lies inside the RAM of the images");
-        }
-        if self.handoff.overlaps(&self.warm_start) {
-            return Err("the handoff overlaps the warm-start cell");
-        }
-        if self.handoff.size as usize != size_of::<handoff::Handoff>() {
-            return Err("the handoff region has not the size of the handoff");
-        }
-        if self.warm_start.size as usize != size_of::<warm_start::WarmStart>() {
-            return Err("the warm-start region has not the size of the warm-start cell");
-        }
-        if !self.handoff.base.is_multiple_of(4) || !self.warm_start.base.is_multiple_of(4) {
-            return Err("the handoff and the warm-start cell must be word-aligned");
-        }
-        if self.warm_start.end() != chip.sram.end() {
-            return Err("the warm-start cell must be the last RAM cell of the chip");
-        }
-        if !chip.sram.contains(self.handoff.base, self.handoff.size) {
-            return Err("the handoff lies outside the chip's SRAM");
-        }
         Ok(())
+    }
+
+    const fn check_staging(&self) -> Result<(), &'static str> {
+        let Some(staging) = &self.staging else { return Ok(()) };
+        let last = &self.programs[self.programs.len() - 1];
+        let is_last = self.chip.is_whole_sectors(staging)
+            && staging.end() == last.end()
+            && staging.base > last.base
+            && is_one_sector(self.chip, staging);
+        first_broken(&[
+            (
+                self.home.is_none(),
+                "a staging region needs a home of the RAM image, which the compact map has not",
+            ),
+            (
+                !is_last,
+                "the staging region must be the last sector of the last program, and not its only one",
+            ),
+        ])
+    }
+
+    const fn check_ram(&self) -> Result<(), &'static str> {
+        let Self { ram, handoff: to, warm_start: cell, .. } = self;
+        let sram = self.chip.sram;
+        let is_inside = ram.overlaps(to) || ram.overlaps(cell);
+        let has_sizes = [
+            to.size as usize == size_of::<handoff::Handoff>(),
+            cell.size as usize == size_of::<warm_start::WarmStart>(),
+        ];
+        let are_aligned = to.base.is_multiple_of(4) && cell.base.is_multiple_of(4);
+        first_broken(&[
+            (!sram.contains(ram.base, ram.size), "the RAM of the images lies outside the chip's SRAM"),
+            (!ram.size.is_multiple_of(8), "the initial stack pointer must be a multiple of 8 (AAPCS)"),
+            (is_inside, "the handoff or the warm-start cell lies inside the RAM of the images"),
+            (to.overlaps(cell), "the handoff overlaps the warm-start cell"),
+            (!has_sizes[0], "the handoff region has not the size of the handoff"),
+            (!has_sizes[1], "the warm-start region has not the size of the warm-start cell"),
+            (!are_aligned, "the handoff and the warm-start cell must be word-aligned"),
+            (cell.end() != sram.end(), "the warm-start cell must be the last RAM cell of the chip"),
+            (!sram.contains(to.base, to.size), "the handoff lies outside the chip's SRAM"),
+        ])
+    }
+
+    const fn is_in_bootloader(&self, region: &Region) -> bool {
+        region.overlaps(&self.bootloader) || overlaps_one(region, self.home.as_slice())
     }
 
     /// Address of the callgate table.
@@ -340,11 +319,38 @@ impl Layout {
     }
 }
 
-const fn overlaps_optional(region: &Region, other: &Option<Region>) -> bool {
-    match other {
-        Some(other) => region.overlaps(other),
-        None => false,
+/// The text of the first rule that is broken.
+const fn first_broken(rules: &[(bool, &'static str)]) -> Result<(), &'static str> {
+    let mut rule = 0;
+    while rule < rules.len() {
+        if rules[rule].0 {
+            return Err(rules[rule].1);
+        }
+        rule += 1;
     }
+    Ok(())
+}
+
+const fn are_possible(regions: &[Region]) -> bool {
+    let mut n = 0;
+    while n < regions.len() {
+        if !regions[n].is_possible() {
+            return false;
+        }
+        n += 1;
+    }
+    true
+}
+
+const fn overlaps_one(region: &Region, others: &[Region]) -> bool {
+    let mut n = 0;
+    while n < others.len() {
+        if region.overlaps(&others[n]) {
+            return true;
+        }
+        n += 1;
+    }
+    false
 }
 
 const fn is_one_sector(chip: &Geometry, region: &Region) -> bool {

@@ -94,6 +94,11 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
 
+/// Whether an object belongs to an update: a master that writes it is at work.
+const fn is_of_update(index: u16) -> bool {
+    matches!(index, PROGRAM_DATA | PROGRAM_CONTROL | ENABLE_FLASH | UNLOCK | ACCESS | ROM_LOADER)
+}
+
 /// So long after the start, or after the last work on the flash, the device is idle, in ms: a master that has
 /// something to do has begun with it.
 const IDLE_MS: u32 = 1000;
@@ -407,9 +412,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if let Some(written) = self.emcy.write(at, data) {
             return written;
         }
+        self.is_asked |= is_of_update(at.index);
         match (at.index, data) {
             (ACCESS, request) if C::SEALED => {
-                self.is_asked = true;
                 if self.signatures.is_waiting(self.now) {
                     return Err(AbortCode::DEVICE_STATE);
                 }
@@ -423,15 +428,12 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
                 if u32::from_le_bytes([a, b, c, d]) != ROM_LOADER_SIGNATURE {
                     return Err(AbortCode::STORE);
                 }
-                self.is_asked = true;
                 self.download.leave_for_rom_loader(&self.flash)
             }
             (PROGRAM_CONTROL, &[value]) => {
-                self.is_asked = true;
                 self.download.command(Self::program(at.sub), ProgramControl::try_from(value)?)
             }
             (ENABLE_FLASH | UNLOCK, password) if C::PASSWORD => {
-                self.is_asked = true;
                 self.lock.open(password, self.now)?;
                 match at.index {
                     ENABLE_FLASH => self.download.unlock(Self::program(at.sub), true),
@@ -443,7 +445,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        self.is_asked = true;
+        self.is_asked |= is_of_update(at.index);
         if C::SEALED && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }

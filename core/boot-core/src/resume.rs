@@ -35,7 +35,7 @@ impl Partial {
 
     /// The same for a device on which no download goes on after a cut.
     #[must_use]
-    pub(crate) const fn disowned(self) -> Self {
+    pub(crate) const fn forbidden(self) -> Self {
         Self { id: 0, ..self }
     }
 
@@ -52,7 +52,7 @@ impl Partial {
     }
 
     /// It does not go on after a cut any more. Returns whether it could.
-    pub(crate) const fn disown(&mut self) -> bool {
+    pub(crate) const fn forbid(&mut self) -> bool {
         core::mem::replace(&mut self.id, 0) != 0
     }
 

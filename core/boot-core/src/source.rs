@@ -45,15 +45,15 @@ impl<'b> Source<'b> {
     }
 
     /// Another program begins, or none: the queue stays.
-    pub(crate) fn rest(&mut self) {
-        self.unsealer.rest();
+    pub(crate) fn end(&mut self) {
+        self.unsealer.cancel();
         self.ended = None;
     }
 
     /// Discards the received data.
     pub(crate) fn clear(&mut self) {
         self.queue.clear();
-        self.rest();
+        self.end();
     }
 
     /// The program was sent completely, with this date. (A sealed image has its date in the manifest.)
@@ -70,8 +70,8 @@ impl<'b> Source<'b> {
             Some(Progress::Installed { .. }) if self.is_complete() => self.unsealer.expected(),
             Some(_) => return None,
         };
-        let told = self.date.take()?;
-        let date = if self.unsealer.is_active() { self.unsealer.created() } else { told };
+        let announced = self.date.take()?;
+        let date = if self.unsealer.is_active() { self.unsealer.created() } else { announced };
         Some([date, expected.crc.filter(|_| date != 0)?, 0, 0])
     }
 

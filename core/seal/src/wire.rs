@@ -135,6 +135,81 @@ pub fn array<const N: usize>(bytes: &[u8], at: usize) -> [u8; N] {
     bytes.get(at..at + N).and_then(|bytes| bytes.try_into().ok()).unwrap_or([0; N])
 }
 
+/// A field of a fixed size.
+trait Field {
+    fn read(bytes: &[u8], at: usize) -> Self;
+}
+
+impl Field for u8 {
+    fn read(bytes: &[u8], at: usize) -> Self {
+        bytes[at]
+    }
+}
+
+impl Field for u16 {
+    fn read(bytes: &[u8], at: usize) -> Self {
+        half(bytes, at)
+    }
+}
+
+impl Field for u32 {
+    fn read(bytes: &[u8], at: usize) -> Self {
+        word(bytes, at)
+    }
+}
+
+impl Field for u64 {
+    fn read(bytes: &[u8], at: usize) -> Self {
+        Self::from_le_bytes(array(bytes, at))
+    }
+}
+
+impl<const N: usize> Field for [u8; N] {
+    fn read(bytes: &[u8], at: usize) -> Self {
+        array(bytes, at)
+    }
+}
+
+/// The fields of a record: the method that reads each, and its offset in bytes, with which a tool writes it.
+macro_rules! fields {
+    ($Record:ident, $offsets:ident:
+        $($(#[$about:meta])* $name:ident $NAME:ident: $type:ty = $at:literal;)*
+        $(; $($(#[$of:meta])* $hash:ident $HASH:ident = $from:literal;)*)?
+    ) => {
+        impl $Record<'_> {
+            $(
+                $(#[$about])*
+                #[must_use]
+                pub fn $name(self) -> $type {
+                    Field::read(self.0, $at)
+                }
+            )*
+        }
+
+        $(impl<'a> $Record<'a> {
+            $(
+                $(#[$of])*
+                #[must_use]
+                pub fn $hash(self) -> &'a [u8] {
+                    self.0.get($from..$from + HASH).unwrap_or(&[])
+                }
+            )*
+        })?
+
+        /// The offset of each field in bytes.
+        pub mod $offsets {
+            $(
+                $(#[$about])*
+                pub const $NAME: usize = $at;
+            )*
+            $($(
+                $(#[$of])*
+                pub const $HASH: usize = $from;
+            )*)?
+        }
+    };
+}
+
 /// The size of an image's head, as far as these first bytes show it: the head is complete if the
 /// result is not larger than the number of bytes.
 ///
@@ -173,6 +248,51 @@ pub fn head_size(bytes: &[u8]) -> Result<usize, Fault> {
     Ok(at)
 }
 
+fields! { Head, head:
+    /// Bytes of the manifest.
+    manifest_size MANIFEST_SIZE: u16 = 4;
+    /// Number of signatures.
+    signatures SIGNATURES: u8 = 6;
+    /// See [`flag`](super::flag).
+    flags FLAGS: u8 = 7;
+    /// The vendor-ID of the devices for which the image is.
+    vendor_id VENDOR_ID: u32 = 8;
+    /// Their product code.
+    product_code PRODUCT_CODE: u32 = 12;
+    /// The version of the program.
+    version VERSION: u32 = 16;
+    /// The security counter: a device accepts none lower than its own.
+    counter COUNTER: u32 = 20;
+    /// The number of the program, 1 to 254: the sub-index of 1F50h; or that of the bootloader, 255.
+    program PROGRAM: u8 = 24;
+    /// Binary logarithm of a chunk's payload.
+    chunk CHUNK: u8 = 25;
+    /// The lowest version of this format that the bootloader must have.
+    format FORMAT: u16 = 26;
+    /// Bytes of the image as it is in flash.
+    size SIZE: u32 = 28;
+    /// CRC-32 of the image (1F56h).
+    crc CRC: u32 = 32;
+    /// Size of the payload after the signatures in bytes, without the hashes.
+    payload PAYLOAD: u32 = 36;
+    /// Hash of the first chunk.
+    chain CHAIN: [u8; HASH] = 72;
+    /// The nonce, which makes the encryption of each image different.
+    nonce NONCE: [u8; 16] = 104;
+    /// The 96-bit unique ID of the only device for which the image is, or zeros.
+    unique_id UNIQUE_ID: [u8; 12] = 120;
+    /// The hardware revisions for which the image is: bit n for revision numbers (1018h/3) with n
+    /// in the five lowest bits; 0 for all revisions.
+    hardware HARDWARE: u32 = 132;
+    /// The time of creation, in seconds since 1970.
+    created CREATED: u64 = 136;
+;
+    /// SHA-512/256 of the image.
+    image_hash IMAGE_HASH = 40;
+    /// Hash of the program that is the dictionary, or zeros.
+    dictionary DICTIONARY = 144;
+}
+
 /// A complete head (as [`head_size`] reports).
 #[derive(Clone, Copy, Debug)]
 pub struct Head<'a>(pub &'a [u8]);
@@ -181,7 +301,7 @@ impl<'a> Head<'a> {
     /// The manifest: what the signatures cover.
     #[must_use]
     pub fn manifest(self) -> &'a [u8] {
-        self.0.get(..usize::from(half(self.0, 4))).unwrap_or(&[])
+        self.0.get(..usize::from(self.manifest_size())).unwrap_or(&[])
     }
 
     /// The prefix of the manifest in the signed message.
@@ -192,121 +312,6 @@ impl<'a> Head<'a> {
         } else {
             DOMAIN
         }
-    }
-
-    /// Number of signatures.
-    #[must_use]
-    pub fn signatures(self) -> u8 {
-        self.0[6]
-    }
-
-    /// See [`flag`].
-    #[must_use]
-    pub fn flags(self) -> u8 {
-        self.0[7]
-    }
-
-    /// The vendor-ID of the devices for which the image is.
-    #[must_use]
-    pub fn vendor_id(self) -> u32 {
-        word(self.0, 8)
-    }
-
-    /// Their product code.
-    #[must_use]
-    pub fn product_code(self) -> u32 {
-        word(self.0, 12)
-    }
-
-    /// The version of the program.
-    #[must_use]
-    pub fn version(self) -> u32 {
-        word(self.0, 16)
-    }
-
-    /// The security counter: a device accepts none lower than its own.
-    #[must_use]
-    pub fn counter(self) -> u32 {
-        word(self.0, 20)
-    }
-
-    /// The number of the program, 1 to 254: the sub-index of 1F50h; or [`BOOTLOADER`].
-    #[must_use]
-    pub fn program(self) -> u8 {
-        self.0[24]
-    }
-
-    /// Binary logarithm of a chunk's payload.
-    #[must_use]
-    pub fn chunk(self) -> u8 {
-        self.0[25]
-    }
-
-    /// The lowest version of this format that the bootloader must have.
-    #[must_use]
-    pub fn format(self) -> u16 {
-        half(self.0, 26)
-    }
-
-    /// Bytes of the image as it is in flash.
-    #[must_use]
-    pub fn size(self) -> u32 {
-        word(self.0, 28)
-    }
-
-    /// CRC-32 of the image (1F56h).
-    #[must_use]
-    pub fn crc(self) -> u32 {
-        word(self.0, 32)
-    }
-
-    /// Size of the payload after the signatures in bytes, without the hashes.
-    #[must_use]
-    pub fn payload(self) -> u32 {
-        word(self.0, 36)
-    }
-
-    /// SHA-512/256 of the image.
-    #[must_use]
-    pub fn image_hash(self) -> &'a [u8] {
-        self.0.get(40..72).unwrap_or(&[])
-    }
-
-    /// Hash of the first chunk.
-    #[must_use]
-    pub fn chain(self) -> [u8; HASH] {
-        array(self.0, 72)
-    }
-
-    /// The nonce, which makes the encryption of each image different.
-    #[must_use]
-    pub fn nonce(self) -> [u8; 16] {
-        array(self.0, 104)
-    }
-
-    /// The 96-bit unique ID of the only device for which the image is, or zeros.
-    #[must_use]
-    pub fn unique_id(self) -> [u8; 12] {
-        array(self.0, 120)
-    }
-
-    /// The hardware revisions for which the image is: bit n for revision numbers (1018h/3) with n
-    /// in the five lowest bits; 0 for all revisions.
-    #[must_use]
-    pub fn hardware(self) -> u32 {
-        word(self.0, 132)
-    }
-
-    /// The time of creation, in seconds since 1970.
-    #[must_use]
-    pub fn created(self) -> u64 {
-        u64::from_le_bytes(array(self.0, 136))
-    }
-
-    /// Hash of the program that is the dictionary, or zeros.
-    #[must_use]
-    pub fn dictionary(self) -> &'a [u8] {
-        self.0.get(144..176).unwrap_or(&[])
     }
 
     /// The records of the manifest: tag and bytes. A record that exceeds the manifest is returned
@@ -403,31 +408,49 @@ pub struct Recipient<'a>(pub &'a [u8; RECIPIENT]);
 /// Bytes of a [`Recipient`].
 pub const RECIPIENT: usize = 44;
 
-impl Recipient<'_> {
+fields! { Recipient, recipient:
     /// The id of the key-encryption key.
-    #[must_use]
-    pub fn key_id(self) -> u32 {
-        word(self.0, 0)
-    }
-
+    key_id KEY_ID: u32 = 0;
     /// The check value that reveals a wrong key before anything is erased: bytes 32 to 39 of the
     /// key stream.
-    #[must_use]
-    pub fn check(self) -> [u8; 8] {
-        array(self.0, 4)
-    }
-
+    check CHECK: [u8; 8] = 4;
     /// The key of the image, exclusive-or bytes 0 to 31 of the key stream: HMAC-SHA-512 (RFC 2104)
-    /// with the key-encryption key over [`WRAP_DOMAIN`] and the nonce of the image.
-    #[must_use]
-    pub fn wrapped(self) -> [u8; 32] {
-        array(self.0, 12)
-    }
+    /// with the key-encryption key over [`WRAP_DOMAIN`](super::WRAP_DOMAIN) and the nonce of the image.
+    wrapped WRAPPED: [u8; 32] = 12;
 }
 
 /// A root's statement about a key that signs programs.
 #[derive(Clone, Copy, Debug)]
 pub struct Certificate<'a>(pub &'a [u8]);
+
+fields! { Certificate, certificate:
+    /// Its announced size: [`CERTIFICATE`](super::CERTIFICATE).
+    size SIZE: u16 = 4;
+    /// See [`role`](super::role).
+    role ROLE: u8 = 6;
+    /// Algorithm of the key: [`ED25519`](super::ED25519).
+    algorithm ALGORITHM: u8 = 7;
+    /// A device accepts no certificate with an epoch lower than its own; a higher one becomes its
+    /// own.
+    epoch EPOCH: u32 = 8;
+    /// For devices of this vendor.
+    vendor_id VENDOR_ID: u32 = 12;
+    /// For this product, or 0 for all of the vendor.
+    product_code PRODUCT_CODE: u32 = 16;
+    /// The lowest security counter that it may sign.
+    lowest LOWEST: u32 = 20;
+    /// The highest security counter that it may sign.
+    highest HIGHEST: u32 = 24;
+    /// The public key.
+    key KEY: [u8; 32] = 28;
+    /// The id of the signing root.
+    root_id ROOT_ID: u32 = 60;
+    /// The reserved bytes. They are 0, or the certificate is refused: a later format may restrict
+    /// there what the key signs, and a device that does not know the restriction must not ignore it.
+    reserved RESERVED: [u8; RESERVED] = 64;
+    /// The root's signature.
+    signature SIGNATURE: [u8; SIGNATURE] = 88;
+}
 
 impl<'a> Certificate<'a> {
     /// The bytes that the root's signature covers.
@@ -435,84 +458,6 @@ impl<'a> Certificate<'a> {
     pub fn signed(self) -> &'a [u8] {
         self.0.get(..CERTIFIED).unwrap_or(&[])
     }
-
-    /// Its announced size: [`CERTIFICATE`].
-    #[must_use]
-    pub fn len(self) -> u16 {
-        half(self.0, 4)
-    }
-
-    /// Always false.
-    #[must_use]
-    pub fn is_empty(self) -> bool {
-        self.0.is_empty()
-    }
-
-    /// See [`role`].
-    #[must_use]
-    pub fn role(self) -> u8 {
-        self.0[6]
-    }
-
-    /// Algorithm of the key: [`ED25519`].
-    #[must_use]
-    pub fn algorithm(self) -> u8 {
-        self.0[7]
-    }
-
-    /// A device accepts no certificate with an epoch lower than its own; a higher one becomes its
-    /// own.
-    #[must_use]
-    pub fn epoch(self) -> u32 {
-        word(self.0, 8)
-    }
-
-    /// For devices of this vendor.
-    #[must_use]
-    pub fn vendor_id(self) -> u32 {
-        word(self.0, 12)
-    }
-
-    /// For this product, or 0 for all of the vendor.
-    #[must_use]
-    pub fn product_code(self) -> u32 {
-        word(self.0, 16)
-    }
-
-    /// The lowest security counter that it may sign.
-    #[must_use]
-    pub fn lowest(self) -> u32 {
-        word(self.0, 20)
-    }
-
-    /// The highest security counter that it may sign.
-    #[must_use]
-    pub fn highest(self) -> u32 {
-        word(self.0, 24)
-    }
-
-    /// The public key.
-    #[must_use]
-    pub fn key(self) -> [u8; 32] {
-        array(self.0, 28)
-    }
-
-    /// The id of the signing root.
-    #[must_use]
-    pub fn root_id(self) -> u32 {
-        word(self.0, 60)
-    }
-
-    /// The reserved bytes. They are 0, or the certificate is refused: a later format may restrict
-    /// there what the key signs, and a device that does not know the restriction must not ignore it.
-    #[must_use]
-    pub fn reserved(self) -> [u8; RESERVED] {
-        array(self.0, CERTIFIED - RESERVED)
-    }
-
-    /// The root's signature.
-    #[must_use]
-    pub fn signature(self) -> [u8; SIGNATURE] {
-        array(self.0, CERTIFIED)
-    }
 }
+
+const _: () = assert!(certificate::RESERVED + RESERVED == CERTIFIED && certificate::SIGNATURE == CERTIFIED);

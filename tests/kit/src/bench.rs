@@ -70,6 +70,13 @@ impl<'f> Bench<'f> {
         Self::with(flash, Policy::DEFAULT)
     }
 
+    /// After CLEAR.
+    pub fn cleared(flash: &'f mut ModelFlash) -> Self {
+        let mut bench = Self::new(flash);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench
+    }
+
     pub fn with(flash: &'f mut ModelFlash, download: Policy) -> Self {
         Self::with_buffer(flash, download, 256)
     }
@@ -153,15 +160,27 @@ impl<'f> Bench<'f> {
         self.node.download_end(DATA)
     }
 
+    #[track_caller]
     pub fn good(&mut self, block: &[u8]) {
         assert_eq!(self.block(block), (Ok(()), 0));
     }
 
+    /// Blocks that are taken, one after another.
+    #[track_caller]
+    pub fn all_good<B: AsRef<[u8]>>(&mut self, blocks: impl IntoIterator<Item = B>) {
+        blocks.into_iter().for_each(|block| self.good(block.as_ref()));
+    }
+
     pub fn install(&mut self, program: &[u8]) {
         assert_eq!(self.command(CLEAR), 0);
-        for block in block_file(program, 96) {
-            self.good(&block);
-        }
+        self.all_good(block_file(program, 96));
+    }
+
+    /// The same, and its release.
+    #[track_caller]
+    pub fn release(&mut self, program: &[u8]) {
+        self.install(program);
+        assert_eq!(self.command(SET_SIGNATURE), 0);
     }
 }
 

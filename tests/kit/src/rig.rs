@@ -447,6 +447,22 @@ impl Rig {
         }
     }
 
+    /// CLEAR, which is taken, with all work.
+    #[track_caller]
+    pub fn clear(&mut self, program: u8) {
+        self.command(program, 3).expect("CLEAR is taken");
+        self.settle();
+    }
+
+    /// Downloads of one program, one after another, which are taken, with all work.
+    #[track_caller]
+    pub fn send_all<B: AsRef<[u8]>>(&mut self, program: u8, downloads: impl IntoIterator<Item = B>) {
+        for data in downloads {
+            self.send(program, data.as_ref()).expect("good data are taken");
+            self.settle();
+        }
+    }
+
     /// The right password, if there is one.
     pub fn unlock(&mut self, program: u8) -> Result<(), AbortCode> {
         match self.setup.password(program) {
@@ -472,11 +488,9 @@ impl Rig {
     pub fn install(&mut self, program: u8, data: &[u8]) {
         self.unlock(program).expect("the password is right");
         if self.setup.password(program).is_none() {
-            self.command(program, 3).expect("CLEAR is taken");
-            self.settle();
+            self.clear(program);
         }
-        self.send(program, data).expect("a good program is taken");
-        self.settle();
+        self.send_all(program, [data]);
         assert_eq!((self.status(program), self.state(program)), (0, 0));
         self.node.take_boot_request();
     }
@@ -543,6 +557,11 @@ pub fn program(region: Region, product_code: u32, len: usize, seed: u8) -> Vec<u
         bytes[at..at + label::SIZE].copy_from_slice(&Label::new(VENDOR_ID, product_code, seed.into()).emit());
     }
     bytes
+}
+
+/// A program for this number of a setup, which is the seed and the version, too.
+pub fn raw(setup: &Setup, number: u8, len: usize) -> Vec<u8> {
+    program(setup.region(number), PRODUCT_CODE, len, number)
 }
 
 pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {

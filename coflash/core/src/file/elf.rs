@@ -29,50 +29,12 @@ use super::range::AddressRange;
 /// # Errors
 /// The first fault, with its offset.
 pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
-    const CLASS: Place = Place::Offset(4);
-    const DATA: Place = Place::Offset(5);
-    match bytes {
-        [0x7F, b'E', b'L', b'F', 1, 1, ..] => {}
-        [0x7F, b'E', b'L', b'F', 1, _, ..] => {
-            return Err(DATA.fault(Cause::WrongElf("is not little-endian; the device is")))
-        }
-        [0x7F, b'E', b'L', b'F', ..] => {
-            return Err(CLASS.fault(Cause::WrongElf("is not a 32-bit ELF file; the device needs one")))
-        }
-        _ => return Err(Place::Offset(0).fault(Cause::WrongElf("is not an ELF file"))),
-    }
-    let cut_off = |what, needed: u64| {
-        let needed = usize::try_from(needed).unwrap_or(usize::MAX);
-        Place::File.fault(Cause::CutOff { what, needed, found: bytes.len() })
-    };
-    let header = FileHeader32::<Endianness>::parse(bytes).map_err(|_| cut_off("the ELF header", 52))?;
-    let endian = header.endian().map_err(|_| DATA.fault(Cause::WrongElf("has an unknown byte order")))?;
-    let machine = header.e_machine(endian);
-    if machine != EM_ARM {
-        return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
-    }
-    let words = match header.e_type(endian) {
-        ET_EXEC => None,
-        ET_REL => Some("is not a linked program (it is an object file): give the linker's output"),
-        ET_DYN => Some(
-            "is linked for no address (it is a library, or a position-independent program): link it for the \
-             flash of the device (-no-pie)",
-        ),
-        ET_CORE => Some("is not a linked program (it is a dump of the memory): give the linker's output"),
-        _ => Some("is not a linked program: give the linker's output"),
-    };
-    if let Some(words) = words {
-        return Err(Place::Offset(16).fault(Cause::WrongElf(words)));
-    }
-    let header_size = header.e_phentsize(endian);
-    if header.e_phnum(endian) > 0 && usize::from(header_size) != size_of::<ProgramHeader32<Endianness>>() {
-        return Err(Place::Offset(42).fault(Cause::ProgramHeaderSize(header_size)));
-    }
+    let (header, endian) = header_of(bytes)?;
     let table = u64::from(header.e_phoff(endian));
     let table_end = table + u64::from(header.e_phentsize(endian)) * u64::from(header.e_phnum(endian));
     let program_headers = header
         .program_headers(endian, bytes)
-        .map_err(|_| cut_off("the table of program headers", table_end))?;
+        .map_err(|_| cut_off(bytes, "the table of program headers", table_end))?;
 
     let loads = || {
         let with_size = program_headers.iter().map(|segment| (segment, u64::from(segment.p_filesz(endian))));
@@ -86,7 +48,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     for (segment, size) in loads() {
         let end = u64::from(segment.p_offset(endian)) + size;
         if end > bytes.len() as u64 {
-            return Err(cut_off("the file", end));
+            return Err(cut_off(bytes, "the file", end));
         }
     }
     // Linkers write the section headers last: without them the file was cut off, even if all
@@ -94,7 +56,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     let table = u64::from(header.e_shoff(endian));
     let table_end = table + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
     if table != 0 && table_end > bytes.len() as u64 {
-        return Err(cut_off("the table of section headers", table_end));
+        return Err(cut_off(bytes, "the table of section headers", table_end));
     }
     let sections = header.section_headers(endian, bytes).map_err(|_| {
         Place::Offset(table as usize).fault(Cause::WrongElf("has a damaged table of sections"))
@@ -127,6 +89,53 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
     }
     pieces.into_image()
+}
+
+/// The header of a linked program for the device.
+fn header_of(bytes: &[u8]) -> Result<(&FileHeader32<Endianness>, Endianness), ReadError> {
+    const CLASS: Place = Place::Offset(4);
+    const DATA: Place = Place::Offset(5);
+    match bytes {
+        [0x7F, b'E', b'L', b'F', 1, 1, ..] => {}
+        [0x7F, b'E', b'L', b'F', 1, _, ..] => {
+            return Err(DATA.fault(Cause::WrongElf("is not little-endian; the device is")))
+        }
+        [0x7F, b'E', b'L', b'F', ..] => {
+            return Err(CLASS.fault(Cause::WrongElf("is not a 32-bit ELF file; the device needs one")))
+        }
+        _ => return Err(Place::Offset(0).fault(Cause::WrongElf("is not an ELF file"))),
+    }
+    let header =
+        FileHeader32::<Endianness>::parse(bytes).map_err(|_| cut_off(bytes, "the ELF header", 52))?;
+    let endian = header.endian().map_err(|_| DATA.fault(Cause::WrongElf("has an unknown byte order")))?;
+    let machine = header.e_machine(endian);
+    if machine != EM_ARM {
+        return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
+    }
+    let words = match header.e_type(endian) {
+        ET_EXEC => None,
+        ET_REL => Some("is not a linked program (it is an object file): give the linker's output"),
+        ET_DYN => Some(
+            "is linked for no address (it is a library, or a position-independent program): link it for the \
+             flash of the device (-no-pie)",
+        ),
+        ET_CORE => Some("is not a linked program (it is a dump of the memory): give the linker's output"),
+        _ => Some("is not a linked program: give the linker's output"),
+    };
+    if let Some(words) = words {
+        return Err(Place::Offset(16).fault(Cause::WrongElf(words)));
+    }
+    let header_size = header.e_phentsize(endian);
+    if header.e_phnum(endian) > 0 && usize::from(header_size) != size_of::<ProgramHeader32<Endianness>>() {
+        return Err(Place::Offset(42).fault(Cause::ProgramHeaderSize(header_size)));
+    }
+    Ok((header, endian))
+}
+
+/// The fault of a file that must have this many bytes.
+fn cut_off(bytes: &[u8], what: &'static str, needed: u64) -> ReadError {
+    let needed = usize::try_from(needed).unwrap_or(usize::MAX);
+    Place::File.fault(Cause::CutOff { what, needed, found: bytes.len() })
 }
 
 /// The parts of a file that are the contents of the memory.

@@ -212,27 +212,7 @@ impl fmt::Display for Inspection {
             Some(blocks) => {
                 let count = blocks.all.len();
                 writeln!(f, "{}, {count} blocks, every {} is right", self.format, blocks.checksum)?;
-            }
-        }
-        if let Some(blocks) = &self.blocks {
-            let Blocks { program_start, program_size, program_crc, .. } = blocks;
-            let digits = match blocks.checksum {
-                Checksum::Crc32 => 8,
-                Checksum::Crc16 => 4,
-            };
-            writeln!(f, "  program      {program_size} bytes from {program_start:#010x} on, CRC {program_crc:0digits$X}h")?;
-            if let Some(Identity { vendor_id, product_code, .. }) = blocks.identity() {
-                writeln!(f, "  for          vendor-ID {vendor_id:08X}h, product code {product_code:08X}h")?;
-            }
-            if blocks.control.is_none() {
-                let size = blocks.all.first().map_or(0, |block| block.size);
-                writeln!(f, "  block 0      {size} bytes of the product's own, for its own check")?;
-            }
-            if let Some((version, date)) = blocks.release() {
-                match date {
-                    0 => writeln!(f, "  version      {version}")?,
-                    date => writeln!(f, "  version      {version} of {}", Date(date))?,
-                }
+                blocks.program(f)?;
             }
         }
         if let Some(version) = &self.software_version {
@@ -247,17 +227,12 @@ impl fmt::Display for Inspection {
             writeln!(f, "  bootloader   version {version}, {size} bytes, CRC {crc:08X}h")?;
             writeln!(f, "  for          vendor-ID {vendor:08X}h, product code {product:08X}h, board {board:08X}h, services {services}, facts {facts:08X}h")?;
         }
+        write!(f, "  judged       ")?;
         match (&self.bootloader, &self.judgement) {
-            (Some((_, Ok(()))), _) => {
-                writeln!(f, "  judged       a bootloader: {}", Advice::RenewsDevice)?;
-            }
-            (Some((_, Err(fault))), _) => {
-                writeln!(f, "  judged       {fault}: {}", Advice::IsRefused)?;
-            }
-            (None, Ok(())) => {
-                writeln!(f, "  judged       can be a program: stack pointer and reset vector are plausible")?;
-            }
-            (None, Err(fault)) => writeln!(f, "  judged       {fault}: {}", Advice::IsRefused)?,
+            (Some((_, Ok(()))), _) => writeln!(f, "a bootloader: {}", Advice::RenewsDevice)?,
+            (Some((_, Err(fault))), _) => writeln!(f, "{fault}: {}", Advice::IsRefused)?,
+            (None, Err(fault)) => writeln!(f, "{fault}: {}", Advice::IsRefused)?,
+            (None, Ok(())) => writeln!(f, "can be a program: stack pointer and reset vector are plausible")?,
         }
         if let (Ok(()), Some(stack)) = (&self.judgement, self.stack_at_end) {
             writeln!(f, "  caution      {stack}")?;
@@ -265,12 +240,9 @@ impl fmt::Display for Inspection {
         for note in &self.notes {
             writeln!(f, "  caution      {note}")?;
         }
-        let (bytes, pieces) = (self.bytes, self.segments.len());
-        writeln!(
-            f,
-            "  data         {bytes} bytes in {pieces} {}",
-            if pieces == 1 { "piece" } else { "pieces" }
-        )?;
+        let (bytes, count) = (self.bytes, self.segments.len());
+        let pieces = if count == 1 { "piece" } else { "pieces" };
+        writeln!(f, "  data         {bytes} bytes in {count} {pieces}")?;
         for segment in &self.segments {
             let area = Area::of(segment.first).map(|area| format!(", in {area}")).unwrap_or_default();
             writeln!(f, "    {segment}  {:>7} bytes{area}", segment.len())?;
@@ -278,9 +250,40 @@ impl fmt::Display for Inspection {
         for gap in self.gaps() {
             writeln!(f, "  gap          {gap}, {} bytes", gap.len())?;
         }
-        let Some(blocks) = &self.blocks else { return Ok(()) };
+        self.blocks.as_ref().map_or(Ok(()), |blocks| blocks.table(f))
+    }
+}
+
+impl Blocks {
+    /// Prints what the blocks say of the program.
+    fn program(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { program_start, program_size, program_crc, .. } = self;
+        let digits = match self.checksum {
+            Checksum::Crc32 => 8,
+            Checksum::Crc16 => 4,
+        };
+        writeln!(
+            f,
+            "  program      {program_size} bytes from {program_start:#010x} on, CRC {program_crc:0digits$X}h"
+        )?;
+        if let Some(Identity { vendor_id, product_code, .. }) = self.identity() {
+            writeln!(f, "  for          vendor-ID {vendor_id:08X}h, product code {product_code:08X}h")?;
+        }
+        if self.control.is_none() {
+            let size = self.all.first().map_or(0, |block| block.size);
+            writeln!(f, "  block 0      {size} bytes of the product's own, for its own check")?;
+        }
+        match self.release() {
+            None => Ok(()),
+            Some((version, 0)) => writeln!(f, "  version      {version}"),
+            Some((version, date)) => writeln!(f, "  version      {version} of {}", Date(date)),
+        }
+    }
+
+    /// Prints one line for each block.
+    fn table(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "  block  address      bytes  CRC")?;
-        for BlockLine { number, flash_address, size, crc } in &blocks.all {
+        for BlockLine { number, flash_address, size, crc } in &self.all {
             match *number {
                 NUMBER_CONTROL => write!(f, "      0  control   ")?,
                 NUMBER_LAST => write!(f, "     -1  last      ")?,

@@ -198,7 +198,7 @@ impl Signer {
 /// Whether the fixed fields of a certificate are those of the format.
 fn is_sound(certificate: wire::Certificate<'_>) -> bool {
     certificate.0.starts_with(&CERTIFICATE_MAGIC)
-        && usize::from(certificate.len()) == CERTIFICATE
+        && usize::from(certificate.size()) == CERTIFICATE
         && u16::from(certificate.algorithm()) == ED25519
         && certificate.reserved() == [0; RESERVED]
 }

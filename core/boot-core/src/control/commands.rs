@@ -4,6 +4,7 @@
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
 use seal::access::right;
+use shared_abi::geometry::Region;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
@@ -69,10 +70,8 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
         let erases = again || (self.policy.erase)(program) == Erase::AtOnce;
         let withdrawn = state.record.is_some_and(|record| record.withdrawn);
-        if !self.rights.permits(right_of(command, erases, withdrawn)) {
-            return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
-        }
-        if changes && (state.locked || !(self.policy.allowed)()) {
+        let has_right = self.rights.permits(right_of(command, erases, withdrawn));
+        if !has_right || changes && (state.locked || !(self.policy.allowed)()) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
         state.failure = None;
@@ -80,17 +79,11 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
         let record = state.record.filter(|_| !data);
         match (command, record) {
             (Clear, _) => {
-                let region = state.region;
                 // Before the transfer is aborted, because the abort marks an open session as
                 // failed.
                 state.session = Session::Cleared { just: true };
-                self.download_cancel();
-                if !self.programmer.has_cleared(program) {
-                    self.programmer.abort();
-                    if erases {
-                        self.programmer.erase_all(program, region);
-                    }
-                }
+                let region = state.region;
+                self.clear(program, region, erases);
             }
             (Start, Some(_)) if fresh => self.boot_request = Some(BootRequest::Fresh(program)),
             (Start, Some(record)) => self.boot_request = Some(start_request(program, record.signed)),
@@ -108,6 +101,18 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
             (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
         }
         Ok(())
+    }
+
+    /// CLEAR, in its flash half.
+    fn clear(&mut self, program: u8, region: Region, erases: bool) {
+        self.download_cancel();
+        if self.programmer.has_cleared(program) {
+            return;
+        }
+        self.programmer.abort();
+        if erases {
+            self.programmer.erase_all(program, region);
+        }
     }
 
     /// 2008h: the device leaves for the loader in the ROM of the chip. It can erase everything, so what keeps

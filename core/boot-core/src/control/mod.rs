@@ -73,7 +73,7 @@ struct Program {
     /// The version in the last control block; of the bootloader itself, that of the image in 1F56h.
     version: u32,
     /// The creation date in the last control block, in seconds since 1970-01-01 UTC; 0 for none.
-    told_date: u32,
+    announced_date: u32,
     /// The creation date of the stored program, in the same way.
     date: u32,
     /// The last complete transfer was a raw image or Intel HEX, and no command followed.
@@ -159,7 +159,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
                 session: Session::Idle,
                 partial,
                 version: 0,
-                told_date: 0,
+                announced_date: 0,
                 date: date::<C>(&parameters, flash, number, region, record),
                 streamed: false,
                 start_when_verified: false,
@@ -399,54 +399,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
                 }
             }
             Some(Event::Stored { program, ends }) => {
-                let (record, partial) = load::<C>(&self.parameters, flash, program, &self.rights);
-                if C::RENEWS {
-                    self.note_record(program, record);
-                }
-                if let Some(state) = find::<C>(&mut self.programs, program) {
-                    state.record = record;
-                    state.date = date::<C>(&self.parameters, flash, program, state.region, record);
-                    if record.is_none() {
-                        state.identification = 0;
-                    }
-                    let open = matches!(state.session, Session::Open { .. });
-                    if !open {
-                        state.partial = partial;
-                    }
-                    if ends && open && is_same {
-                        state.session = Session::Idle;
-                    }
-                }
+                self.take_record(flash, program, ends && is_same);
                 if ends {
                     self.end(program, Ok(()));
                 }
             }
             Some(Event::Written { program, expected, crc }) => {
-                if let Some(state) = find::<C>(&mut self.programs, program) {
-                    state.identification = crc;
-                    state.session = Session::Idle;
-                }
-                match self.check_stored(flash, program, &expected, crc) {
-                    Ok(version) => {
-                        let whole = expected.crc.is_none() || self.programmer.source().unsealer.is_active();
-                        let signed = whole && self.policy.valid_without_signature;
-                        let size = expected.size;
-                        let half_erased = self.programmer.is_half_erased();
-                        let confirmed = false;
-                        let record = ProgramRecord {
-                            size,
-                            crc,
-                            signed,
-                            confirmed,
-                            version,
-                            half_erased,
-                            seal: None,
-                            withdrawn: false,
-                        };
-                        let record = self.programmer.source().unsealer.mark(record);
-                        self.programmer.record(&mut self.parameters, program, record, false);
-                    }
-                    Err(error) => self.end(program, Err(error)),
+                if let Err(error) = self.record(flash, program, &expected, crc) {
+                    self.end(program, Err(error));
                 }
             }
             Some(Event::Failed { program, error, erasing }) => {
@@ -471,6 +431,57 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
         step
     }
 
+    /// The record of a program was stored or removed. `ends_session`: a sealed image that was installed already
+    /// ends its download.
+    fn take_record<F: Flash>(&mut self, flash: &F, program: u8, ends_session: bool) {
+        let (record, partial) = load::<C>(&self.parameters, flash, program, &self.rights);
+        if C::RENEWS {
+            self.note_record(program, record);
+        }
+        let Some(state) = find::<C>(&mut self.programs, program) else { return };
+        state.record = record;
+        state.date = date::<C>(&self.parameters, flash, program, state.region, record);
+        if record.is_none() {
+            state.identification = 0;
+        }
+        let open = matches!(state.session, Session::Open { .. });
+        if !open {
+            state.partial = partial;
+        }
+        if open && ends_session {
+            state.session = Session::Idle;
+        }
+    }
+
+    /// A program was written completely, with this CRC in flash: stores its record.
+    fn record<F: Flash>(
+        &mut self,
+        flash: &F,
+        program: u8,
+        expected: &Expected,
+        crc: u32,
+    ) -> Result<(), FlashError> {
+        if let Some(state) = find::<C>(&mut self.programs, program) {
+            state.identification = crc;
+            state.session = Session::Idle;
+        }
+        let version = self.check_stored(flash, program, expected, crc)?;
+        let whole = expected.crc.is_none() || self.programmer.source().unsealer.is_active();
+        let record = ProgramRecord {
+            size: expected.size,
+            crc,
+            signed: whole && self.policy.valid_without_signature,
+            confirmed: false,
+            version,
+            half_erased: self.programmer.is_half_erased(),
+            seal: None,
+            withdrawn: false,
+        };
+        let record = self.programmer.source().unsealer.mark(record);
+        self.programmer.record(&mut self.parameters, program, record, false);
+        Ok(())
+    }
+
     /// Compacts the store from so many used places on, unless there is other work or a download is open. Returns
     /// whether it begins.
     pub(crate) fn compact(&mut self, is_idle: bool) -> bool {
@@ -493,7 +504,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
         if self.policy.data == Some(program) {
             return Ok(state.version);
         }
-        if expected.crc.is_some_and(|told| told != crc) || check_vectors(flash, region, self.layout).is_err()
+        if expected.crc.is_some_and(|sent| sent != crc) || check_vectors(flash, region, self.layout).is_err()
         {
             return Err(FlashError::NoValidProgram);
         }
@@ -514,8 +525,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
             partial: Partial::NONE,
         };
         // The version of a control block takes precedence.
-        let told = state.version;
-        let checked = judge.check_label(&label).map(|version| if told == 0 { version } else { told });
+        let announced = state.version;
+        let checked =
+            judge.check_label(&label).map(|version| if announced == 0 { version } else { announced });
         checked.map_err(|Refusal(error, _)| error)
     }
 
@@ -534,7 +546,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
         state.failure = outcome.err().map(|error| Failure { error, detail: self.programmer.take_detail() });
         if outcome.is_err() {
             // Nothing goes on with a program that was refused as a whole.
-            self.programmer.disown(program);
+            self.programmer.forbid_resume(program);
             state.streamed = false;
             if !matches!(state.session, Session::Idle) {
                 state.session = Session::Failed;

@@ -203,7 +203,7 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
         crc: u32,
     ) -> Result<RenewalRecord, FlashError> {
         let places = Places::of(self.layout).ok_or(FlashError::Unspecified)?;
-        if expected.crc.is_some_and(|told| told != crc) {
+        if expected.crc.is_some_and(|sent| sent != crc) {
             return Err(FlashError::NoValidProgram);
         }
         let image =

@@ -146,7 +146,7 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
             Err(refusal) => {
                 // What is stored of the data before it does not go on after a cut.
                 if matches!(judge.session, Session::Open { next } if next != 1) {
-                    self.programmer.disown(program);
+                    self.programmer.forbid_resume(program);
                 }
                 if findings.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
                     // Its pieces belong to a download that does not start.
@@ -173,7 +173,7 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
         if let Some(begin) = findings.begins {
             // A RAM image has its version in its header.
             if staging.is_none() {
-                (state.version, state.told_date) = (begin.version, begin.date);
+                (state.version, state.announced_date) = (begin.version, begin.date);
             }
             let mut next = 1;
             let goes_on = C::RESUMES && state.resumable().is_same(begin.partial);
@@ -184,10 +184,10 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
                 }
                 if C::RESUMES && !goes_on {
                     state.partial = Partial::NONE;
-                    self.programmer.disown(program);
+                    self.programmer.forbid_resume(program);
                 }
             } else {
-                let mut partial = if C::RESUMES { begin.partial } else { begin.partial.disowned() };
+                let mut partial = if C::RESUMES { begin.partial } else { begin.partial.forbidden() };
                 if goes_on && matches!(state.session, Session::Idle) && findings.sealed.is_none() {
                     partial = state.partial;
                     next = ANY;
@@ -203,7 +203,7 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
                 self.programmer.open(program, region, erases, begin.size, partial);
                 if findings.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
-                    self.programmer.disown(program);
+                    self.programmer.forbid_resume(program);
                     self.programmer.source_mut().unsealer.begin(Place {
                         layout: self.layout,
                         policy: &self.policy.seal,
@@ -222,7 +222,7 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
             *next = self.programmer.source_mut().queue.last.next();
         }
         if let Some(expected) = findings.complete {
-            self.programmer.complete(expected, state.told_date);
+            self.programmer.complete(expected, state.announced_date);
             if is_stream {
                 state.streamed = true;
                 state.start_when_verified = self.policy.starts_by_itself;

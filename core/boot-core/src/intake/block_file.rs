@@ -37,7 +37,7 @@ pub(super) struct BlockFile {
     /// The number of bytes that the client announced.
     announced: Option<u32>,
     /// The last four bytes after the data: the CRC in the block.
-    told: u32,
+    sent_crc: u32,
     /// The CRC of header and data that have arrived.
     crc: u32,
 }
@@ -60,7 +60,7 @@ impl Format for BlockFile {
             header: Header { number: 0, flash_address: 0, size: 0 },
             start: [0; HEADER_SIZE],
             announced: None,
-            told: 0,
+            sent_crc: 0,
             crc: 0,
         })
     }
@@ -88,25 +88,12 @@ impl Format for BlockFile {
         if self.len != FRAMING + header.size as usize {
             return Err(Refusal(FlashError::Format, AbortCode::LENGTH));
         }
-        if self.crc != self.told {
+        if self.crc != self.sent_crc {
             return Err(Refusal::unfit(FlashError::Crc));
         }
         let malformed = Refusal::unfit(FlashError::Format);
         if let (true, Session::Open { next }) = (is_data(&header), to.judge.session) {
-            // A client that sends to several devices repeats a block until all of them have it.
-            if to.queue.last.is_again(next, header.number) {
-                if !to.queue.last.has_crc(self.crc) {
-                    return Err(Refusal::untimely(FlashError::Sequence));
-                }
-                to.queue.discard();
-                return Ok(());
-            }
-            let end = to.queue.last.end();
-            if to.judge.images.only_sealed().is_some() && next == ANY && header.flash_address != end {
-                // The bytes of a sealed image are processed in order, and each once.
-                if header.flash_address + header.size > end {
-                    return Err(Refusal::untimely(FlashError::Sequence));
-                }
+            if self.has_come(next, to)? {
                 to.queue.discard();
                 return Ok(());
             }
@@ -117,30 +104,7 @@ impl Format for BlockFile {
             &*fields
         });
         match header.number {
-            NUMBER_CONTROL => {
-                let control = fields.and_then(Control::parse);
-                to.judge.check_identity(&AppInfo::of_block(control, to.queue))?;
-                to.queue.discard();
-                let (size, version, date) = match control {
-                    None | Some(Control::Plain) => (0, 0, 0),
-                    Some(Control::Identity(identity)) => (identity.app_size, 0, 0),
-                    Some(Control::Dated { identity, version, date }) => {
-                        (identity.app_size, version, of_control(date))
-                    }
-                };
-                // A control block without a size is the same for too many programs.
-                let id = if size == 0 { 0 } else { self.crc };
-                let partial = Partial::begin(id, to.judge.region.base);
-                to.findings.begins = Some(Begin { size, version, date, partial });
-                if let Some(linked) = to.judge.images.only_sealed() {
-                    // The sequence begins again over what was processed, if it is that of the same file.
-                    if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
-                        return Err(Refusal::untimely(FlashError::Sequence));
-                    }
-                    to.findings.begins = Some(Begin { size: 0, version: 0, date: 0, partial });
-                    to.findings.sealed = Some(linked);
-                }
-            }
+            NUMBER_CONTROL => self.take_control(fields.and_then(Control::parse), to)?,
             NUMBER_LAST if to.judge.images.only_sealed().is_some() => {
                 // The manifest of the sealed image describes the program.
                 to.queue.discard();
@@ -183,13 +147,54 @@ impl Format for BlockFile {
 }
 
 impl BlockFile {
+    /// Whether this block of data has come before.
+    fn has_come(&self, next: u32, to: &Destination<'_, '_>) -> Result<bool, Refusal> {
+        let Header { number, flash_address, size } = self.header;
+        let last = &to.queue.last;
+        // A client that sends to several devices repeats a block until all of them have it.
+        if last.is_again(next, number) {
+            return last.has_crc(self.crc).then_some(true).ok_or(Refusal::untimely(FlashError::Sequence));
+        }
+        if to.judge.images.only_sealed().is_none() || next != ANY || flash_address == last.end() {
+            return Ok(false);
+        }
+        // The bytes of a sealed image are processed in order, and each once.
+        (flash_address + size <= last.end()).then_some(true).ok_or(Refusal::untimely(FlashError::Sequence))
+    }
+
+    /// The control block begins the program.
+    fn take_control(&self, control: Option<Control>, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+        to.judge.check_identity(&AppInfo::of_block(control, to.queue))?;
+        to.queue.discard();
+        let (size, version, date) = match control {
+            None | Some(Control::Plain) => (0, 0, 0),
+            Some(Control::Identity(identity)) => (identity.app_size, 0, 0),
+            Some(Control::Dated { identity, version, date }) => {
+                (identity.app_size, version, of_control(date))
+            }
+        };
+        // A control block without a size is the same for too many programs.
+        let id = if size == 0 { 0 } else { self.crc };
+        let partial = Partial::begin(id, to.judge.region.base);
+        to.findings.begins = Some(Begin { size, version, date, partial });
+        if let Some(linked) = to.judge.images.only_sealed() {
+            // The sequence begins again over what was processed, if it is that of the same file.
+            if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
+                return Err(Refusal::untimely(FlashError::Sequence));
+            }
+            to.findings.begins = Some(Begin { size: 0, version: 0, date: 0, partial });
+            to.findings.sealed = Some(linked);
+        }
+        Ok(())
+    }
+
     /// Takes the next byte.
     fn push(&mut self, byte: u8, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         let at = self.len;
         self.len += 1;
         if at >= HEADER_SIZE + self.header.size as usize {
             // The CRC. Further bytes are detected by the length.
-            self.told = self.told >> 8 | u32::from(byte) << 24;
+            self.sent_crc = self.sent_crc >> 8 | u32::from(byte) << 24;
             return Ok(());
         }
         self.crc = to.judge.policy.crc.resume(self.crc, &[byte]);

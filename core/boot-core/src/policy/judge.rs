@@ -117,8 +117,8 @@ impl Judge<'_> {
         };
         match (verdict, identity, self.policy.identity) {
             (Verdict::Refuse(error), ..) => Err(Refusal::unfit(error)),
-            (Verdict::Standard, Some(told), Some(device)) => {
-                fits((told.vendor_id, told.product_code), device).map_err(|difference| {
+            (Verdict::Standard, Some(image), Some(device)) => {
+                fits((image.vendor_id, image.product_code), device).map_err(|difference| {
                     Refusal::unfit(match difference {
                         Difference::VendorId => FlashError::WrongVendorId,
                         Difference::ProductCode => FlashError::WrongProductId,

@@ -207,7 +207,7 @@ impl<'b, C: Choices> Programmer<'b, C> {
         };
         let (untouched, clearing, opened, half_erased) = (Some(ahead), false, true, true);
         let ahead = erased;
-        self.source.rest();
+        self.source.end();
         if let Some(target) =
             self.target.as_mut().filter(|target| target.program == program && target.clearing)
         {
@@ -229,10 +229,10 @@ impl<'b, C: Choices> Programmer<'b, C> {
 
     /// The download of this program does not go on after a cut: a part of it was refused, or its pieces
     /// are of another file from here on.
-    pub(crate) fn disown(&mut self, program: u8) {
+    pub(crate) fn forbid_resume(&mut self, program: u8) {
         let Some(target) = self.target.as_mut().filter(|target| target.program == program) else { return };
         // The first piece removes the record in any case.
-        if C::RESUMES && target.partial.disown() && target.untouched.is_none() {
+        if C::RESUMES && target.partial.forbid() && target.untouched.is_none() {
             self.void(program);
         }
     }
@@ -755,7 +755,7 @@ impl<'b, C: Choices> Programmer<'b, C> {
         let size = match (self.source.size(), ahead - region.base) {
             (Some(size), _) => size,
             (None, 0) => region.size,
-            (None, told) => told,
+            (None, announced) => announced,
         };
         target.untouched = None;
         target.ahead = target.ahead.max(ahead);

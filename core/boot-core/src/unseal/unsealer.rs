@@ -142,9 +142,9 @@ impl<'b> Unsealer<'b> {
     }
 
     /// Ends the processing of an image, or of a request.
-    pub(crate) fn rest(&mut self) {
+    pub(crate) fn cancel(&mut self) {
         if let Some(workshop) = self.0.get_mut() {
-            workshop.rest();
+            workshop.cancel();
         }
     }
 
@@ -169,7 +169,7 @@ impl<'b> Unsealer<'b> {
     fn end(&mut self, outcome: Outcome) {
         let Some(workshop) = self.0.get_mut() else { return };
         workshop.news.outcome = outcome;
-        workshop.rest();
+        workshop.cancel();
     }
 
     /// Returns what was found out since the last call.
@@ -266,7 +266,7 @@ impl Work {
 
 impl Workshop {
     /// Ends the work, and removes its secrets.
-    fn rest(&mut self) {
+    fn cancel(&mut self) {
         if matches!(self.work, Work::Image(_)) {
             self.buffers.wipe();
         }

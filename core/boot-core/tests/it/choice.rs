@@ -435,8 +435,7 @@ macro_rules! rules {
 fn broken(facts: &Facts, choice: &Choice<()>) -> Vec<&'static str> {
     let mut broken = Vec::new();
     let Choice { store, waits, damage, exit } = *choice;
-    let Row { bootloader, stored, crashes, .. } = *facts.row;
-    let Bootloader { home_loads, staging_loads, at_home, .. } = bootloader;
+    let Row { stored, crashes, .. } = *facts.row;
 
     let asked = facts.policy.sealed && facts.asks(&[10, 11, 12]) && !stored;
     let first = Choice { store: Some(Store::Asked), waits: false, damage: None, exit: Exit::Choose };
@@ -490,30 +489,39 @@ fn broken(facts: &Facts, choice: &Choice<()>) -> Vec<&'static str> {
                 if true => trial == (facts.program(number) == Unreleased);
         }
     }
-    if let Exit::Bootloader { place, origin, stay, crash_resets, renewal, .. } = exit {
-        let is_confirmed = facts.staging(&[State::Confirmed]);
-        rules! { broken:
-            "an image that does not load is never entered"
-                if true => if place == HOME { home_loads } else { staging_loads && place == STAGING };
-            "the origin is that of the place"
-                if true => (place == HOME) == (origin == Origin::Home);
-            "what is on trial runs once, by a request"
-                if origin == Origin::Trial => facts.tries();
-            "a trial that was asked for is made"
-                if facts.tries() && staging_loads => origin == Origin::Trial;
-            "only a confirmed image takes the place of home"
-                if origin == Origin::Confirmed => is_confirmed && (at_home != Foreign || !home_loads);
-            "a confirmed image runs, unless a probe has written home"
-                if is_confirmed && staging_loads && !(at_home == Foreign && home_loads) =>
-                    origin == Origin::Confirmed;
-            "the spare runs only if home is damaged"
-                if origin == Origin::Spare => facts.staging(&[State::Installed]) && !home_loads;
-            "the count that is reported is that of now"
-                if true => crash_resets == facts.crashes();
-            "the end of a trial is reported, and nothing else"
-                if true => of_word(renewal).1 == facts.trial_end();
-        }
+    if let Exit::Bootloader { stay, .. } = exit {
+        broken.extend(broken_entry(facts, exit));
         broken.extend(broken_stay(facts, stay));
+    }
+    broken
+}
+
+/// Each rule that the entry into an image of the bootloader breaks.
+fn broken_entry(facts: &Facts, exit: Exit<()>) -> Vec<&'static str> {
+    let mut broken = Vec::new();
+    let Exit::Bootloader { place, origin, crash_resets, renewal, .. } = exit else { return broken };
+    let Bootloader { home_loads, staging_loads, at_home, .. } = facts.row.bootloader;
+    let is_confirmed = facts.staging(&[State::Confirmed]);
+    rules! { broken:
+        "an image that does not load is never entered"
+            if true => if place == HOME { home_loads } else { staging_loads && place == STAGING };
+        "the origin is that of the place"
+            if true => (place == HOME) == (origin == Origin::Home);
+        "what is on trial runs once, by a request"
+            if origin == Origin::Trial => facts.tries();
+        "a trial that was asked for is made"
+            if facts.tries() && staging_loads => origin == Origin::Trial;
+        "only a confirmed image takes the place of home"
+            if origin == Origin::Confirmed => is_confirmed && (at_home != Foreign || !home_loads);
+        "a confirmed image runs, unless a probe has written home"
+            if is_confirmed && staging_loads && !(at_home == Foreign && home_loads) =>
+                origin == Origin::Confirmed;
+        "the spare runs only if home is damaged"
+            if origin == Origin::Spare => facts.staging(&[State::Installed]) && !home_loads;
+        "the count that is reported is that of now"
+            if true => crash_resets == facts.crashes();
+        "the end of a trial is reported, and nothing else"
+            if true => of_word(renewal).1 == facts.trial_end();
     }
     broken
 }

@@ -1,19 +1,15 @@
 //! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
 
 use canopen::AbortCode;
+use kit::bench::CLEAR;
 use kit::model::{until_power_cut, Cut};
-use kit::rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
+use kit::rig::{raw, Rig, AT_ONCE_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::Region;
 
-const CLEAR: u8 = 0x03;
 /// No sector.
 const NONE: [u32; 0] = [];
 const BUSY: u32 = 1;
 const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
-
-fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
-    program(setup.region(number), PRODUCT_CODE, len, number)
-}
 
 /// The sectors of a program that were erased since the last call, by their addresses, each once.
 fn erased(rig: &Rig, number: u8) -> Vec<u32> {
@@ -80,8 +76,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     // installed since.
     let image = raw(&STANDARD_1, 1, 3000);
     for installed_since in [false, true] {
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         rig.begin(1, Some(3000), &image[..2500]).unwrap();
         rig.steps(60);
         rig.reset();
@@ -111,8 +106,7 @@ fn every_clear_that_erases_does_so() {
     assert_eq!(rig.status(1) & BUSY, BUSY);
     rig.settle();
     assert_eq!(erased(&rig, 1), sectors(1500));
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     assert_eq!(erased(&rig, 1), NONE);
 }
 
@@ -167,8 +161,7 @@ fn a_refusal_ends_the_row_of_clears() {
     let mut rig = Rig::new(&STANDARD_1, 1024);
     rig.install(1, &raw(&STANDARD_1, 1, 1500));
     for _ in 0..3 {
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         assert!(rig.send(1, &[0; 8]).is_err());
         assert_eq!(rig.state(1), 0, "the program stays");
     }
@@ -208,8 +201,7 @@ fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
                 rig.reset();
                 rig.chip.model().cut = Some((number, cut));
                 let was_cut = until_power_cut(|| {
-                    rig.command(1, CLEAR).unwrap();
-                    rig.settle();
+                    rig.clear(1);
                     if seed < 8 {
                         rig.command(1, CLEAR).unwrap();
                     }
@@ -248,8 +240,7 @@ fn a_command_is_refused_as_untimely_only_while_the_status_says_busy() {
                 for command in [0x01, 0x02, 0x83, 0x84] {
                     let mut rig = Rig::new(setup, 4096);
                     rig.install(1, &raw(setup, 1, 3000));
-                    rig.command(1, CLEAR).unwrap();
-                    rig.settle();
+                    rig.clear(1);
                     rig.begin(1, Some(3000), &raw(setup, 1, 3000)[..sent]).unwrap();
                     rig.steps(steps);
                     rig.cancel(1);

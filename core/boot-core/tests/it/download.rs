@@ -37,13 +37,11 @@ fn a_program_may_fill_its_region_and_not_a_byte_more() {
     let image = program(size, 0x12);
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    bench.install(&image);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&image);
     assert_eq!(flash.cells(PROGRAM), image);
     assert_eq!(autostart(&flash), Ok(0x12));
     // In one download.
-    let mut bench = Bench::new(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
+    let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.stream(&image, Some(PROGRAM.size), 7), (Ok(()), 0));
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
 
@@ -51,9 +49,7 @@ fn a_program_may_fill_its_region_and_not_a_byte_more() {
     for behind in [1, 16] {
         assert_eq!(bench.command(CLEAR), 0);
         let file = block_file(&image, 96);
-        for block in &file[..file.len() - 2] {
-            bench.good(block);
-        }
+        bench.all_good(&file[..file.len() - 2]);
         let number = file.len() as u32 - 2;
         let wrong = block(number, PROGRAM.end() - 16 + behind, &[0; 16]);
         let (outcome, status) = bench.block(&wrong);
@@ -122,9 +118,7 @@ fn a_product_with_crc_16_takes_blocks_and_programs_that_carry_it() {
         for wrong in [&block_file(&image, 96)[0], &upper] {
             assert_eq!(bench.block(wrong), (Err(AbortCode(0x0800_0020)), 0x06));
         }
-        for block in &good {
-            bench.good(block);
-        }
+        bench.all_good(&good);
         assert_eq!(bench.word(IDENTIFICATION), crc16(&image));
         assert_eq!(bench.command(SET_SIGNATURE), 0);
         assert_eq!(starts(&flash, CrcKind::Crc16), Ok(true));
@@ -169,11 +163,8 @@ fn blocks_may_begin_and_end_at_any_byte() {
     for chunk in [1, 3, 5, 7, 33] {
         let image = program(120, 0x22);
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!(bench.command(CLEAR), 0);
-        for block in block_file(&image, chunk) {
-            bench.good(&block);
-        }
+        let mut bench = Bench::cleared(&mut flash);
+        bench.all_good(block_file(&image, chunk));
         assert_eq!(&flash.cells(PROGRAM)[..120], image, "blocks of {chunk}");
     }
 }
@@ -259,15 +250,12 @@ fn every_wrong_block_is_refused_and_the_next_attempt_works() {
     ];
     for (what, bad, abort, status) in cases {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!(bench.command(CLEAR), 0);
+        let mut bench = Bench::cleared(&mut flash);
         bench.good(&good[0]);
         bench.node.flash().touched.clear();
         assert_eq!(bench.block(&bad), (Err(abort), status), "{what}");
         assert_eq!(bench.node.flash().touched, [], "{what}: the flash was touched");
-        for block in &good[1..] {
-            bench.good(block);
-        }
+        bench.all_good(&good[1..]);
         assert_eq!(bench.command(SET_SIGNATURE), 0, "{what}");
         assert_eq!(autostart(&flash), Ok(0x33), "{what}");
     }
@@ -278,8 +266,7 @@ fn control_and_last_blocks_of_other_lengths_or_sizes_are_refused() {
     let image = program(96, 0x44);
     let good = block_file(&image, 96);
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
+    let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.block(&block(0, 0, &[0; 16])), (Err(AbortCode(0x0800_0020)), 0x04));
     bench.good(&good[0]);
     bench.good(&good[1]);
@@ -307,8 +294,7 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
     // contains only the first vector.
     for (stored, told) in [(&image, &other), (&nowhere, &nowhere)] {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!(bench.command(CLEAR), 0);
+        let mut bench = Bench::cleared(&mut flash);
         bench.good(&block(0, 0, &[0; 8]));
         bench.good(&block(1, PROGRAM.base, &stored[..4]));
         bench.good(&block(2, PROGRAM.base + 4, &stored[4..]));
@@ -381,17 +367,14 @@ fn a_transfer_cut_off_in_the_middle_leaves_no_trace() {
     let good = block_file(&image, 96);
     for cut in 0..good[1].len() {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!(bench.command(CLEAR), 0);
+        let mut bench = Bench::cleared(&mut flash);
         bench.good(&good[0]);
         bench.node.flash().touched.clear();
         bench.node.download_start(DATA, None).unwrap();
         bench.node.download_data(DATA, &good[1][..cut]).unwrap();
         bench.node.download_cancel(DATA);
         assert_eq!(bench.node.flash().touched, []);
-        for block in &good[1..] {
-            bench.good(block);
-        }
+        bench.all_good(&good[1..]);
     }
 }
 
@@ -455,12 +438,10 @@ fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
     let mut installed = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut installed);
-    bench.install(&old);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&old);
     cut_at_every_operation(&installed, 0xA0, 0xB0, |flash| {
         let mut bench = Bench::new(flash);
-        bench.install(&new);
-        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        bench.release(&new);
     });
 }
 
@@ -495,8 +476,7 @@ fn a_products_own_check_gets_block_0_of_any_length_byte_for_byte() {
     for buffer in [16_384, 20_000] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
-        bench.install(&old);
-        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        bench.release(&old);
         let mut bench = Bench::with_buffer(&mut flash, policy, buffer);
         for len in (0..64).chain([100, 255, 256, 1000, 4096, 16_366, 16_367, 16_368]) {
             let data: Vec<u8> = (0..len).map(|n| byte(len, n)).collect();
@@ -546,8 +526,7 @@ fn a_file_for_another_product_is_refused_before_anything_is_lost() {
     let (old, new) = (program(200, 0xA0), program(200, 0xB0));
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::with(&mut flash, policy);
-    bench.install(&old);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&old);
     bench.node.flash().touched.clear();
     for (what, file, status) in [
         ("vendor-ID", control(0, DEVICE.0 ^ 1, DEVICE.1), 0x80),
@@ -569,9 +548,7 @@ fn a_file_for_another_product_is_refused_before_anything_is_lost() {
     for file in [control(0, 0, 0), control(0, DEVICE.0, DEVICE.1), control(0x600D, 7, 7)] {
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&file);
-        for block in &block_file(&new, 96)[1..] {
-            bench.good(block);
-        }
+        bench.all_good(&block_file(&new, 96)[1..]);
         assert_eq!(bench.command(SET_SIGNATURE), 0);
     }
     assert_eq!(autostart(&flash), Ok(0xB0));
@@ -620,8 +597,7 @@ fn blocks_out_of_order_and_overlapping_ones_are_refused_and_the_program_goes_on(
     let image = program(192, 0x22);
     let good = block_file(&image, 96);
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
+    let mut bench = Bench::cleared(&mut flash);
     bench.good(&good[0]);
     bench.good(&good[1]);
     bench.good(&good[2]);
@@ -630,8 +606,7 @@ fn blocks_out_of_order_and_overlapping_ones_are_refused_and_the_program_goes_on(
     let over = block(3, PROGRAM.base + 100, &[0; 16]);
     assert_eq!(bench.block(&over), (Ok(()), 0x08), "NOTCLEARED");
     assert_eq!(bench.block(&good[3]).0, Err(AbortCode(0x0800_0022)), "half a program is none");
-    bench.install(&image);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&image);
     assert_eq!(autostart(&flash), Ok(0x22));
 }
 
@@ -661,8 +636,7 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
     let (old, new) = (program(200, 0xA0), program(300, 0xB0));
     let mut installed = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut installed);
-    bench.install(&old);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&old);
     let cells = installed.cells(CHIP.flash).to_vec();
 
     /// The first status that is not 0.
@@ -805,13 +779,10 @@ fn the_last_block_of_2008_is_taken() {
     let image = program(1000, 0x22);
     for (reserved, size) in [(32, 8_u32), (32, 40), (28, 8), (28, 36)] {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!(bench.command(CLEAR), 0);
+        let mut bench = Bench::cleared(&mut flash);
         let mut file = block_file(&image, 96);
         file.pop();
-        for block in file {
-            bench.good(&block);
-        }
+        bench.all_good(file);
         let mut last = [u32::MAX, 0, size].map(u32::to_le_bytes).concat();
         last.extend(vec![0xEE; reserved]);
         assert!(reserved == 32 || last.len() == 0x28);

@@ -33,8 +33,7 @@ fn labelled(seed: u8, label: &Label) -> Vec<u8> {
 /// A device with a queue for large blocks, and the old program in flash.
 fn updated(flash: &mut ModelFlash) -> Bench<'_> {
     let mut bench = Bench::with_buffer(flash, POLICY, 2048);
-    bench.install(&program(200, OLD));
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&program(200, OLD));
     bench.node.flash().touched.clear();
     bench
 }

@@ -2,6 +2,7 @@
 //! takes sealed images, and for one that does not (`kit::boot`). Sealed images themselves are tested in
 //! `tests/`.
 
+mod blocks;
 mod choice;
 mod clear;
 mod decision;

@@ -15,31 +15,23 @@ use canopen::od::{Address, Objects};
 use canopen::program::ProgramStart;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
-use kit::bench::{Bench, CONFIG, CONTROL};
+use kit::bench::{Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, SET_SIGNATURE, START};
 use kit::boot::{leaked, Boot};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
-    crc32, program, Rig, Setup, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
+    crc32, raw, Rig, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
 };
 use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::handoff::ResetCause;
 use shared_abi::label;
 use shared_abi::warm_start::BootRequest;
 
-const START: u8 = 0x01;
-const CLEAR: u8 = 0x03;
-const SET_SIGNATURE: u8 = 0x83;
-const CLR_SIGNATURE: u8 = 0x84;
 /// 1F57h: the flash works, and nothing has failed.
-const BUSY: u32 = 1;
+pub(super) const BUSY: u32 = 1;
 
 /// CiA 301, abort codes of SDO: not now, the device is in another state.
-const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
+pub(super) const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
 const NO_SUB_INDEX: AbortCode = AbortCode(0x0609_0011);
-
-fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
-    program(setup.region(number), PRODUCT_CODE, len, number)
-}
 
 fn read(rig: &mut Rig, index: u16, sub: u8) -> Result<Vec<u8>, AbortCode> {
     let mut bytes = [0; 64];
@@ -152,20 +144,19 @@ fn a_control_block_names_the_version() {
     let mut rig = Rig::new(&STANDARD_1, 1024);
     let image = raw(&STANDARD_1, 1, 600);
     for (told, version) in [(0, 1), (77, 77)] {
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         // Manual L-1112d_10, figure 13: size, vendor-ID, product code, version, date.
         let control = kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
         let mut last = 600_u32.to_le_bytes().to_vec();
         last.extend(crc32(&image).to_le_bytes());
-        for block in [
-            kit::rig::block(0, 0, &control),
-            kit::rig::block(1, STANDARD_1.region(1).base, &image),
-            kit::rig::block(u32::MAX, 0, &last),
-        ] {
-            rig.send(1, &block).unwrap();
-            rig.settle();
-        }
+        rig.send_all(
+            1,
+            [
+                kit::rig::block(0, 0, &control),
+                kit::rig::block(1, STANDARD_1.region(1).base, &image),
+                kit::rig::block(u32::MAX, 0, &last),
+            ],
+        );
         assert_eq!((rig.state(1), rig.status(1)), (0, 0));
         assert_eq!(rig.word(0x2005, 1), version);
     }
@@ -182,8 +173,7 @@ fn a_hole_in_a_program_is_erased_with_it() {
     let head = String::from_utf8(kit::rig::hex(region.base, &first)).unwrap();
     let tail = String::from_utf8(kit::rig::hex(region.base + 0x2800, &last)).unwrap();
     let text = head.lines().take(17).chain(tail.lines()).collect::<Vec<_>>().join("\n") + "\n";
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     rig.send(1, text.as_bytes()).unwrap();
     rig.settle();
     assert_eq!((rig.state(1), rig.status(1)), (0, 0));
@@ -206,8 +196,7 @@ fn a_command_for_the_other_program_waits_for_the_end_of_a_download() {
     for steps in 0..60 {
         for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
             let mut rig = Rig::on(&STANDARD_2, 4096, installed.chip.model().clone());
-            rig.command(1, CLEAR).unwrap();
-            rig.settle();
+            rig.clear(1);
             rig.send(1, &image).unwrap();
             rig.steps(steps);
             let what = format!("{command:#x} after {steps} steps");
@@ -250,8 +239,7 @@ fn an_acknowledged_order_is_finishing_until_it_is_stored() {
     let mut rig = Rig::new(&STANDARD_1, 4096);
     let image = raw(&STANDARD_1, 1, 900);
     assert!(!rig.node.is_finishing());
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     rig.begin(1, None, &image).unwrap();
     rig.settle();
     assert!(!rig.node.is_finishing(), "half a program is none");
@@ -359,8 +347,7 @@ fn a_store_while_the_flash_works_is_refused() {
     let image = raw(&STANDARD_1, 1, 900);
     for steps in 0..40 {
         let mut rig = Rig::new(&STANDARD_1, 4096);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         let board = rig.stored().node;
         rig.send(1, &image).unwrap();
         rig.steps(steps);
@@ -428,8 +415,7 @@ fn the_end_of_work_is_told_by_an_emergency() {
     {
         let mut rig = Rig::new(&STANDARD_2, 1024);
         let image = raw(&STANDARD_2, 2, 600);
-        rig.command(2, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(2);
         rig.begin(2, None, &image).unwrap();
         assert_eq!(emergency(&mut rig), None);
         let before = rig.chip.model().operations;
@@ -445,8 +431,7 @@ fn the_end_of_work_is_told_by_an_emergency() {
     }
     // A block with a wrong CRC.
     let mut rig = Rig::new(&STANDARD_1, 1024);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     let mut bad = kit::rig::block(0, 0, &[0; 8]);
     *bad.last_mut().unwrap() ^= 1;
     assert!(rig.send(1, &bad).is_err());
@@ -785,8 +770,7 @@ fn an_event_of_the_line_is_told() {
 #[test]
 fn the_status_is_busy_until_the_program_is_one() {
     let mut rig = Rig::new(&STANDARD_2, 4096);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     rig.send(1, &raw(&STANDARD_2, 1, 900)).unwrap();
     while rig.stored().records[0].is_none() {
         assert_eq!(rig.status(1) & BUSY, BUSY);
@@ -810,8 +794,7 @@ fn the_next_block_is_taken_while_the_flash_works_if_there_is_room() {
     let image = raw(&STANDARD_2, 1, 600);
     for (buffer, room) in [(1024, false), (64 * 1024, true)] {
         let mut rig = Rig::new(&STANDARD_2, buffer);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         rig.send(1, &kit::rig::block(0, 0, &kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
         rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
         assert_eq!(rig.status(1) & BUSY, u32::from(!room));
@@ -831,16 +814,15 @@ fn what_no_block_has_belongs_to_the_program_and_is_erased() {
     let data = raw(&STANDARD_1, 1, 600);
     let mut whole = vec![0xFF; 0x2400];
     whole[..600].copy_from_slice(&data);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    for block in [
-        kit::rig::block(0, 0, &[0; 8]),
-        kit::rig::block(1, region.base, &data),
-        kit::rig::block(u32::MAX, 0, &kit::rig::words(&[0x2400, crc32(&whole)])),
-    ] {
-        rig.send(1, &block).unwrap();
-        rig.settle();
-    }
+    rig.clear(1);
+    rig.send_all(
+        1,
+        [
+            kit::rig::block(0, 0, &[0; 8]),
+            kit::rig::block(1, region.base, &data),
+            kit::rig::block(u32::MAX, 0, &kit::rig::words(&[0x2400, crc32(&whole)])),
+        ],
+    );
     assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&whole)));
     assert_eq!(rig.cells(1)[..whole.len()], whole);
 }
@@ -903,267 +885,4 @@ fn stop_of_a_program_leaves_the_other_one_alone() {
     rig.send(2, &raw(&STANDARD_2, 2, 700)).unwrap();
     rig.settle();
     assert_eq!(rig.stored().records.map(|record| record.map(|record| record.0)), [Some(600), Some(700)]);
-}
-
-// --- the limits of a block, and what is seen of work by another client
-
-/// SYS TEC manual, table 3, shifted by the bit for busy: FORMAT, ADDRESS and SEQUENCE.
-const FORMAT: u32 = 0x04;
-const ADDRESS: u32 = 0x0C;
-const SEQUENCE: u32 = 0x88;
-const LENGTH: AbortCode = AbortCode(0x0607_0010);
-const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
-
-/// A device after CLEAR and a control block, with this buffer.
-fn open(setup: &'static Setup, buffer: usize) -> Rig {
-    let mut rig = Rig::new(setup, buffer);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
-    rig.settle();
-    rig
-}
-
-/// The buffer is the limit: for the size that is announced, for the size in the header, and for what
-/// comes without either.
-#[test]
-fn a_block_is_as_large_as_the_buffer_and_no_larger() {
-    let base = STANDARD_1.region(1).base;
-    let block = |size: usize| kit::rig::block(1, base, &raw(&STANDARD_1, 1, size));
-    for (buffer, largest) in [(1024, 1024), (16 * 1024, 16_384), (64 * 1024, 16_384)] {
-        let largest = largest - 16;
-        // The program has less flash than the largest block.
-        let fits = largest <= STANDARD_1.region(1).size as usize;
-        for announced in [true, false] {
-            let mut rig = open(&STANDARD_1, buffer);
-            let size = |bytes: &[u8]| announced.then_some(bytes.len() as u32);
-            let (good, large) = (block(largest), block(largest + 1));
-            // So few bytes that the header is not complete, and so many that it is.
-            rig.begin(1, size(&good), &good[..8]).unwrap();
-            rig.cancel(1);
-            let first = rig.begin(1, size(&large), &large[..8]);
-            assert_eq!(first, if announced { Err(LENGTH_TOO_HIGH) } else { Ok(()) }, "{buffer}");
-            rig.cancel(1);
-            assert_eq!(rig.begin(1, size(&large), &large[..12]), Err(LENGTH_TOO_HIGH), "{buffer}");
-            // What the header does not announce.
-            let mut hidden = block(largest + 2);
-            hidden[8..12].copy_from_slice(&4_u32.to_le_bytes());
-            rig.begin(1, None, &hidden[..largest + 16]).unwrap();
-            rig.cancel(1);
-            assert_eq!(rig.begin(1, None, &hidden[..largest + 17]), Err(LENGTH_TOO_HIGH), "{buffer}");
-            if fits {
-                assert_eq!(rig.begin(1, size(&good), &good), Ok(()), "{buffer}");
-            }
-        }
-    }
-}
-
-/// No flash has 65536 blocks: a larger number begins something else.
-#[test]
-fn the_first_number_tells_a_block() {
-    let base = STANDARD_1.region(1).base;
-    for (number, status) in [(0xFFFF, SEQUENCE), (0x1_0000, FORMAT)] {
-        let mut rig = Rig::new(&STANDARD_1, 1024);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
-        assert!(rig.send(1, &kit::rig::block(number, base, &[0; 64])).is_err());
-        assert_eq!(rig.status(1), status, "{number:X}");
-    }
-}
-
-/// The last block of the manual of 2008 has 32 bytes more than its header says, and no other has.
-#[test]
-fn only_the_last_block_may_be_longer_than_it_says() {
-    let region = STANDARD_1.region(1);
-    let image = raw(&STANDARD_1, 1, 64);
-    let old = |number: u32, address: u32, data: &[u8; 40], told: u32| {
-        let mut bytes = kit::rig::words(&[number, address, told]);
-        bytes.extend(data);
-        bytes.extend(crc32(&bytes).to_le_bytes());
-        bytes
-    };
-    let mut last = [0; 40];
-    last[32..36].copy_from_slice(&64_u32.to_le_bytes());
-    last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
-    for (number, told, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
-        let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
-        rig.settle();
-        let sent = rig.send(1, &old(number, region.base + 64, &last, told));
-        assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {told}");
-        rig.settle();
-        assert_eq!(rig.state(1), if good { 0 } else { 3 });
-    }
-}
-
-/// The two first vectors are the least that can be started, and less is no program.
-#[test]
-fn a_program_is_its_first_two_vectors_at_least() {
-    let region = STANDARD_1.region(1);
-    for (size, status) in [(7, FORMAT), (8, 0)] {
-        let image = raw(&STANDARD_1, 1, 8);
-        let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
-        rig.settle();
-        let last = kit::rig::block(u32::MAX, 0, &kit::rig::words(&[size, crc32(&image[..size as usize])]));
-        assert_eq!(rig.send(1, &last).is_ok(), status == 0, "{size}");
-        rig.settle();
-        assert_eq!(rig.status(1), status, "{size}");
-    }
-}
-
-/// Intel HEX with segments reaches 64 KiB from the base of the segment. What lies below is at a place
-/// that is no program's; what goes beyond is not Intel HEX.
-#[test]
-fn a_record_stays_in_its_segment() {
-    let segment = kit::ihex::record(0, 2, &[0x10, 0x00]);
-    for (offset, status) in [(0x2000, ADDRESS), (0xFFF0, ADDRESS), (0xFFF1, FORMAT)] {
-        let mut rig = Rig::new(&STANDARD_1, 4096);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
-        let text = format!("{segment}\n{}\n", kit::ihex::record(offset, 0, &[0; 16]));
-        assert!(rig.send(1, text.as_bytes()).is_err());
-        rig.settle();
-        assert_eq!(rig.status(1), status, "{offset:X}");
-    }
-}
-
-/// A raw image with a size: all its flash is erased while it comes, not only what it has reached.
-#[test]
-fn a_size_that_is_told_is_erased_ahead() {
-    let image = raw(&STANDARD_1, 1, 0x3000);
-    for told in [true, false] {
-        let mut rig = Rig::new(&STANDARD_1, 8 * 1024);
-        rig.install(1, &image);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
-        let next = raw(&STANDARD_1, 1, 0x2800);
-        rig.begin(1, told.then_some(next.len() as u32), &next[..1600]).unwrap();
-        rig.settle();
-        assert_eq!(rig.cells(1)[0x2000..0x2800].iter().all(|byte| *byte == 0xFF), told, "told: {told}");
-    }
-}
-
-/// CLEAR of the program that is being downloaded begins it anew, at any time; the other one waits.
-#[test]
-fn clear_ends_the_download_of_its_own_program() {
-    let image = raw(&STANDARD_2, 1, 600);
-    let mut rig = open(&STANDARD_2, 1024);
-    rig.send(1, &kit::rig::block(1, STANDARD_2.region(1).base, &image)).unwrap();
-    assert_eq!(rig.status(1) & BUSY, BUSY);
-    assert_eq!(rig.command(2, CLEAR), Err(MAN_BUSY));
-    assert_eq!(rig.command(1, CLEAR), Ok(()));
-    rig.settle();
-    rig.install(1, &image);
-}
-
-/// A command for one program fails beside an open block of the other one, which goes on.
-#[test]
-fn a_block_goes_on_beside_a_command_that_fails() {
-    let mut rig = Rig::new(&STANDARD_2, 4096);
-    let (one, two) = (raw(&STANDARD_2, 1, 600), raw(&STANDARD_2, 2, 600));
-    rig.install(2, &two);
-    rig.command(2, CLR_SIGNATURE).unwrap();
-    rig.settle();
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    let base = STANDARD_2.region(1).base;
-    let last = kit::rig::words(&[600, crc32(&one)]);
-    for block in
-        [kit::rig::block(0, 0, &[0; 8]), kit::rig::block(1, base, &one), kit::rig::block(u32::MAX, 0, &last)]
-    {
-        rig.begin(1, None, &block[..10]).unwrap();
-        let next = rig.chip.model().operations + 1;
-        rig.chip.model().fail = Some((next, FlashFault::Protected));
-        rig.command(2, SET_SIGNATURE).unwrap();
-        rig.settle();
-        assert_eq!(rig.status(2), 0x10, "NVDATA");
-        let at = Address::new(0x1F50, 1);
-        assert_eq!(rig.node.download_data(at, &block[10..]), Ok(()));
-        assert_eq!(rig.node.download_end(at), Ok(()));
-        rig.settle();
-    }
-    assert_eq!((rig.state(1), rig.identification(1)), (0, crc32(&one)));
-}
-
-/// An emergency reports work that has ended: a block that is refused has its answer.
-#[test]
-fn a_refused_block_is_no_emergency() {
-    let mut rig = open(&STANDARD_1, 1024);
-    let base = STANDARD_1.region(1).base;
-    assert!(rig.send(1, &kit::rig::block(7, base + 0x400, &[0; 64])).is_err());
-    rig.settle();
-    assert_eq!((rig.status(1), rig.node.next_emergency()), (SEQUENCE, None));
-}
-
-/// A release that is stored does not end the download that has begun, and has changed nothing yet.
-#[test]
-fn a_release_beside_an_open_download_leaves_it_open() {
-    let (old, new) = (raw(&STANDARD_1, 1, 600), raw(&STANDARD_1, 1, 900));
-    let mut rig = Rig::new(&STANDARD_1, 4096);
-    rig.install(1, &old);
-    rig.command(1, CLR_SIGNATURE).unwrap();
-    rig.settle();
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
-    rig.command(1, SET_SIGNATURE).unwrap();
-    rig.settle();
-    assert_eq!(rig.stored().records[0].map(|record| record.2), Some(true), "it is released");
-    let base = STANDARD_1.region(1).base;
-    let last = kit::rig::words(&[900, crc32(&new)]);
-    for block in [kit::rig::block(1, base, &new), kit::rig::block(u32::MAX, 0, &last)] {
-        assert_eq!(rig.send(1, &block), Ok(()));
-        rig.settle();
-    }
-    assert_eq!((rig.status(1), rig.identification(1)), (0, crc32(&new)));
-}
-
-/// One piece of a stream may begin the program and be refused: then nothing waits for the flash.
-#[test]
-fn a_stream_that_is_refused_as_it_begins_leaves_nothing() {
-    let image = raw(&STANDARD_1, 1, 600);
-    let text = kit::ihex::intel_hex(STANDARD_1.region(1).base, &image);
-    let mut rig = Rig::new(&STANDARD_1, 1024);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    let at = Address::new(0x1F50, 1);
-    rig.node.download_start(at, None).unwrap();
-    // More than a piece of 128 bytes, and after it no record.
-    let bad = format!("{}\n:X", text.lines().take(12).collect::<Vec<_>>().join("\n"));
-    assert!(rig.node.download_data(at, bad.as_bytes()).is_err());
-    rig.cancel(1);
-    rig.settle();
-    assert_eq!(rig.status(1), FORMAT);
-    rig.install(1, &image);
-}
-
-/// A record waits beside the piece that it belongs to in half of the buffer.
-#[test]
-fn a_record_fits_into_half_of_the_buffer() {
-    let image = raw(&STANDARD_1, 1, 640);
-    let base = STANDARD_1.region(1).base;
-    // Half of it is a record of 16 bytes and 4 headers of 8, exactly, or a byte less.
-    for (buffer, fits) in [(96, true), (95, false)] {
-        let mut rig = Rig::new(&STANDARD_1, buffer);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
-        let sent = rig.send(1, kit::ihex::intel_hex(base, &image).as_bytes());
-        assert_eq!(sent.is_ok(), fits, "{buffer}: {sent:?}");
-        rig.settle();
-        assert_eq!(rig.state(1) == 0, fits, "{buffer}");
-    }
-}
-
-/// While the flash erases, a quarter of the buffer is kept for answers that are held back.
-#[test]
-fn a_quarter_of_the_buffer_is_for_held_answers() {
-    let mut rig = Rig::new(&STANDARD_1, 1024);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    rig.begin(1, None, &raw(&STANDARD_1, 1, 600)[..7]).unwrap();
-    let at = Address::new(0x1F50, 1);
-    let (free, held) = (rig.node.download_space(at, false), rig.node.download_space(at, true));
-    // The open piece has a header of 8 bytes; another one, and its end, may follow.
-    assert_eq!((free, held), (1024 - 8 - 7 - 2 * 8 - 256, 1024 - 8 - 7 - 2 * 8));
 }

@@ -6,7 +6,7 @@ use boot_core::flash::{run, Flash, FlashFault, Operation};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use canopen::od::{Address, Objects};
 use canopen::{BitRate, Instant, NodeId};
-use kit::bench::{node, program, Bench, CLR_SIGNATURE, CONFIG, SET_SIGNATURE, START};
+use kit::bench::{node, program, Bench, CLR_SIGNATURE, CONFIG, START};
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
@@ -584,8 +584,7 @@ fn after_two_updates_a_day_for_ten_years_a_start_takes_as_long_as_at_first() {
             bench.settle();
             bench.node.set_time(Instant::from_millis(if rests { 3_000 } else { 0 }));
             bench.settle();
-            bench.install(&program(200, n as u8));
-            assert_eq!(bench.command(SET_SIGNATURE), 0);
+            bench.release(&program(200, n as u8));
             assert_eq!(bench.node.write(Address::new(0x1F51, 1), &[START]), Ok(()));
             flash.bytes_read.set(0);
             let journal = Journal::open(&flash, JOURNAL);

@@ -4,11 +4,11 @@
 use boot_core::flash::is_write_protected;
 use boot_core::store::{Journal, ProgramRecord};
 use canopen::AbortCode;
+use kit::bench::CLEAR;
 use kit::rig::{
     block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
 
-const CLEAR: u8 = 0x03;
 /// Program 1 of the model: sector 4 with 400h bytes, then 5 to 11 with 800h each.
 const FIRST: u8 = 4;
 const LAST: u8 = 11;
@@ -102,8 +102,7 @@ fn blocks_are_refused_before_the_record_is_removed() {
         let mut rig = Rig::new(&STANDARD_1, 8192);
         rig.install(1, &old);
         rig.chip.model().protected = vec![sector];
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         assert_eq!(rig.status(1), 0, "CLEAR alone loses nothing");
         rig.send(1, &control).unwrap();
         rig.settle();
@@ -132,8 +131,7 @@ fn a_sector_that_is_protected_in_mid_download_is_named() {
     // Block 1 ends in sector 5, which is erased for it. Block 2 ends there as well, block 3 in sector 6.
     for (sector, sent) in [(5, 1), (6, 2)] {
         let mut rig = Rig::new(&STANDARD_1, 8192);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         rig.send(1, &control).unwrap();
         let mut blocks = (1..).zip([(0, 1200), (1200, 2000), (2000, 4000)]);
         let mut send = |rig: &mut Rig| {
@@ -161,8 +159,7 @@ fn a_clear_that_erases_loses_nothing_either() {
             rig.install(1, &old);
             rig.chip.model().protected = vec![sector];
             for _ in 0..times {
-                rig.command(1, CLEAR).unwrap();
-                rig.settle();
+                rig.clear(1);
             }
             assert_eq!(rig.status(1), secured(sector), "{}", setup.name);
             assert_stays(&mut rig, &old, setup.name);
@@ -176,8 +173,7 @@ fn a_clear_at_once_erases_in_the_middle_of_a_download() {
     let image = raw(&AT_ONCE_2, 3000, 1);
     for steps in [0, 1, 2, 5, 20, 100, 1000] {
         let mut rig = Rig::new(&AT_ONCE_2, 8192);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
+        rig.clear(1);
         rig.begin(1, Some(3000), &image[..1400]).unwrap();
         rig.steps(steps);
         if rig.command(1, CLEAR) == Err(AbortCode::DEVICE_STATE) {

@@ -59,9 +59,7 @@ fn try_send(flash: &mut ModelFlash, file: &[Vec<u8>]) -> (usize, u32) {
     }
     bench.good(&file[0]);
     let data = &file[1 + done..file.len() - 1];
-    for block in data {
-        bench.good(block);
-    }
+    bench.all_good(data);
     let (outcome, status) = bench.block(&file[file.len() - 1]);
     assert_eq!(outcome, Ok(()));
     (data.len(), status)
@@ -121,18 +119,14 @@ fn a_host_that_comes_back_goes_on_with_the_next_block() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
     assert_eq!(partial(&mut bench), (0, 0));
-    for block in &file[..6] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..6]);
     let end = PROGRAM.base + 5 * CHUNK as u32;
     assert_eq!(partial(&mut bench), (crc_of(&file[0]), end));
     bench.good(&file[0]);
     assert_eq!(partial(&mut bench), (crc_of(&file[0]), end), "the same file goes on");
     // A block that does not join the data.
     assert_eq!(bench.transfer(&file[7]), Err(AbortCode::DEVICE_STATE));
-    for block in &file[6..] {
-        bench.good(block);
-    }
+    bench.all_good(&file[6..]);
     assert!(is_installed(&flash, &image));
     assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0), "nothing is left to go on with");
 }
@@ -160,9 +154,7 @@ fn a_product_without_resumption_leaves_no_begun_download() {
     // The same with resumption, so that the zero means something.
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    for block in &file[..20] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..20]);
     assert_eq!(partial(&mut Bench::new(&mut flash)).0, crc_of(&file[0]));
 }
 
@@ -174,17 +166,13 @@ fn a_host_that_begins_again_gets_through() {
     for clear in [false, true] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
-        for block in &file[..20] {
-            bench.good(block);
-        }
+        bench.all_good(&file[..20]);
         let mut bench = Bench::new(&mut flash);
         assert_ne!(partial(&mut bench).0, 0);
         if clear {
             assert_eq!(bench.command(CLEAR), 0);
         }
-        for block in &file {
-            bench.good(block);
-        }
+        bench.all_good(&file);
         assert!(is_installed(&flash, &image), "clear: {clear}");
     }
 }
@@ -197,9 +185,7 @@ fn other_data_do_not_become_a_program() {
     let file = named(&image);
     let mut cut_off = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut cut_off);
-    for block in &file[..30] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..30]);
 
     // The same control block; a byte differs in data that are already there.
     let mut other = image.clone();
@@ -211,9 +197,7 @@ fn other_data_do_not_become_a_program() {
     let done = (partial(&mut bench).1 - PROGRAM.base) as usize / CHUNK;
     assert!(done >= 10, "the byte is there");
     bench.good(&file_of_other[0]);
-    for block in &file_of_other[1 + done..file.len() - 1] {
-        bench.good(block);
-    }
+    bench.all_good(&file_of_other[1 + done..file.len() - 1]);
     assert_eq!(bench.block(&last(&other)).1, 0x02, "NOVALPROG: the CRC over all decides");
     assert!(!is_installed(&flash, &other) && !is_installed(&flash, &image));
 
@@ -224,11 +208,8 @@ fn other_data_do_not_become_a_program() {
     assert!(!is_installed(&flash, &image));
     // CLEAR, and everything anew.
     flash.power_on();
-    let mut bench = Bench::new(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
-    for block in &file {
-        bench.good(block);
-    }
+    let mut bench = Bench::cleared(&mut flash);
+    bench.all_good(&file);
     assert!(is_installed(&flash, &image));
 }
 
@@ -243,9 +224,7 @@ fn a_download_of_two_files_does_not_go_on() {
     for sent in [0, 4, 24] {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
-        for block in &file[..=sent] {
-            bench.good(block);
-        }
+        bench.all_good(&file[..=sent]);
         assert_eq!(partial(&mut bench).0, crc_of(&file[0]));
         bench.good(&control_of_other);
         assert_eq!(partial(&mut bench).0, 0, "{sent} blocks");
@@ -287,9 +266,7 @@ fn progress_is_stored_each_kib_and_ends_with_the_program() {
     for sent in 0..=end {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
-        for block in &file[..=sent] {
-            bench.good(block);
-        }
+        bench.all_good(&file[..=sent]);
         let told = partial(&mut bench);
         let stored = partial(&mut Bench::new(&mut flash));
         if sent == 0 || sent == end {
@@ -322,9 +299,7 @@ fn the_progress_of_a_large_program_is_stored_sixteen_times() {
     let mut flash = ModelFlash::new(&LARGE_CHIP);
     let mut bench = Bench::with_config(&mut flash, Config { layout: &LARGE, ..CONFIG }, 256);
     let file = named(&program(64 * 1024, 0x33));
-    for block in &file[..file.len() - 1] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..file.len() - 1]);
     let in_journal = |at: &&Region| LAYOUT.parameters.iter().any(|own| own.contains(at.base, at.size));
     let words = flash.touched.iter().filter(in_journal).filter(|at| at.size == 4).count();
     // Seven words each: the journal's header, and a record with the first data and behind each sixteenth
@@ -416,9 +391,7 @@ fn a_refusal_ends_what_could_go_on() {
     let file = named(&image);
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    for block in &file[..=20] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..=20]);
     let wrong = block(21, 0x2000_0000, &[0; CHUNK]);
     let mut damaged = file[21].clone();
     damaged[20] ^= 1;
@@ -432,14 +405,11 @@ fn a_refusal_ends_what_could_go_on() {
     send(&mut flash, &file);
     assert!(is_installed(&flash, &image));
     // A program that is refused as a whole; CLEAR does the same.
-    let mut bench = Bench::new(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
+    let mut bench = Bench::cleared(&mut flash);
     bench.good(&file[0]);
     assert_eq!((partial(&mut bench).0 == 0, bench.command(CLEAR)), (false, 0));
     assert_eq!(partial(&mut bench), (0, 0));
-    for block in &file[..file.len() - 1] {
-        bench.good(block);
-    }
+    bench.all_good(&file[..file.len() - 1]);
     assert_eq!(bench.block(&last(&program(0xC00, 0x34))).1, 0x02, "NOVALPROG");
     assert_eq!(partial(&mut bench).0, 0);
     assert_eq!(partial(&mut Bench::new(&mut flash)).0, 0);

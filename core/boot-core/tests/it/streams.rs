@@ -263,8 +263,7 @@ fn what_is_seen_in_time_erases_nothing() {
         // Large enough for a first piece of 1 KiB.
         let policy = Policy { identity: Some(IDENTITY), ..Policy::DEFAULT };
         let mut bench = Bench::with_buffer(&mut flash, policy, 8192);
-        bench.install(&old);
-        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        bench.release(&old);
         assert_eq!(bench.command(CLEAR), 0);
         bench.node.flash().touched.clear();
         assert_eq!(bench.stream(&data, size, 7), (Err(abort), status), "{what}");
@@ -411,9 +410,7 @@ fn two_formats_in_one_session_are_refused() {
     bench.good(&blocks[0]);
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x88));
     assert_eq!(bench.stream(hex(&image, 16, "\n").as_bytes(), None, 7), (Err(STATE), 0x88));
-    for block in &blocks[1..] {
-        bench.good(block);
-    }
+    bench.all_good(&blocks[1..]);
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.block(&blocks[1]), (Err(STATE), 0x88));
@@ -447,8 +444,7 @@ fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
     let (old, new) = (program(200, 0xD0), program(300, 0xE0));
     let mut installed = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut installed);
-    bench.install(&old);
-    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    bench.release(&old);
     for data in [new.clone(), hex(&new, 16, "\n").into_bytes()] {
         cut_at_every_operation(&installed, 0xD0, 0xE0, |flash| {
             let mut bench = Bench::new(flash);

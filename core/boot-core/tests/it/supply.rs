@@ -4,15 +4,13 @@ use boot_core::canopen::lss::StoreError;
 use boot_core::control::Policy;
 use canopen::od::{Address, Objects};
 use canopen::{AbortCode, NodeId};
-use kit::bench::Bench;
+use kit::bench::{Bench, SET_SIGNATURE};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
     block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
 use std::task::Poll;
 
-const CLEAR: u8 = 0x03;
-const SET_SIGNATURE: u8 = 0x83;
 /// 1F57h: NO_ACCESS ("programming is not allowed at present", L-1112d_10 table 3); in the upper half, 1 for the
 /// supply (docs/protocol.md).
 const LOW_SUPPLY: u32 = 0x0001_0084;
@@ -55,8 +53,7 @@ fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
     let mut rig = Rig::new(&STANDARD_1, 8192);
     rig.install(1, &old);
     set_low(&rig, true);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     assert_eq!(rig.status(1), 0, "CLEAR alone loses nothing");
     let control = [3000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat();
     rig.send(1, &block(0, 0, &control)).unwrap();
@@ -76,8 +73,7 @@ fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
     let mut rig = Rig::new(&AT_ONCE_2, 8192);
     rig.install(1, &old);
     set_low(&rig, true);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
+    rig.clear(1);
     assert_eq!(rig.status(1), LOW_SUPPLY);
     rig.reset();
     assert_eq!(rig.identification(1), kit::rig::crc32(&old));

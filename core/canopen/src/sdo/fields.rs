@@ -39,9 +39,9 @@ pub const ABORT: u8 = 0x80;
 /// Initiate, "e": the data are in the frame itself.
 pub const EXPEDITED: u8 = 0x02;
 /// Initiate, "s": the frame has the size.
-pub const SIZE_TOLD: u8 = 0x01;
+pub const SIZE_INDICATED: u8 = 0x01;
 /// Initiate of a block transfer, "s": the frame has the size. It is another bit than elsewhere.
-pub const BLOCK_SIZE_TOLD: u8 = 0x02;
+pub const BLOCK_SIZE_INDICATED: u8 = 0x02;
 /// Initiate of a block transfer: this side supports the CRC.
 pub const CRC: u8 = 0x04;
 /// Segment, "t": alternates, starting with 0.

@@ -64,7 +64,7 @@ impl Payload {
     fn parse(bytes: &[u8; 8]) -> Self {
         let command = bytes[0];
         let data = fields::data(bytes);
-        match (command & fields::EXPEDITED != 0, command & fields::SIZE_TOLD != 0) {
+        match (command & fields::EXPEDITED != 0, command & fields::SIZE_INDICATED != 0) {
             (true, true) => Self::Expedited(Chunk::with_unused(&data, fields::unused_of_4(command))),
             (true, false) => Self::Unsized(data),
             (false, true) => Self::Segmented(Some(u32::from_le_bytes(data))),
@@ -76,10 +76,10 @@ impl Payload {
     fn emit(&self) -> (u8, [u8; 4]) {
         match self {
             Self::Expedited(data) => {
-                ((data.unused() & 0x03) << 2 | fields::EXPEDITED | fields::SIZE_TOLD, data.bytes)
+                ((data.unused() & 0x03) << 2 | fields::EXPEDITED | fields::SIZE_INDICATED, data.bytes)
             }
             Self::Unsized(data) => (fields::EXPEDITED, *data),
-            Self::Segmented(Some(size)) => (fields::SIZE_TOLD, size.to_le_bytes()),
+            Self::Segmented(Some(size)) => (fields::SIZE_INDICATED, size.to_le_bytes()),
             Self::Segmented(None) => (0x00, [0; 4]),
         }
     }
@@ -396,12 +396,12 @@ const fn crc_bit(crc: bool) -> u8 {
 
 /// The size that an initiate of a block transfer announces.
 fn size_of(bytes: &[u8; 8]) -> Option<u32> {
-    (bytes[0] & fields::BLOCK_SIZE_TOLD != 0).then(|| fields::number(bytes))
+    (bytes[0] & fields::BLOCK_SIZE_INDICATED != 0).then(|| fields::number(bytes))
 }
 
 const fn size_bit(size: Option<u32>) -> u8 {
     match size {
-        Some(_) => fields::BLOCK_SIZE_TOLD,
+        Some(_) => fields::BLOCK_SIZE_INDICATED,
         None => 0,
     }
 }

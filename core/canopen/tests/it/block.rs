@@ -411,6 +411,13 @@ fn hears(client: &mut impl Transfer, now: u32, frames: &[[u8; 8]]) {
     }
 }
 
+/// The frames that it sends, and the answers to them.
+#[track_caller]
+fn asks(client: &mut impl Transfer, now: u32, sent: &[[u8; 8]], heard: &[[u8; 8]]) {
+    sends(client, now, sent);
+    hears(client, now, heard);
+}
+
 #[track_caller]
 fn ends(client: &mut impl Transfer, now: u32, frames: &[[u8; 8]], result: Result<(), SdoError>) {
     for bytes in frames {
@@ -422,75 +429,55 @@ fn ends(client: &mut impl Transfer, now: u32, frames: &[[u8; 8]], result: Result
 #[test]
 fn client_makes_a_block_download() {
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[granted(127)]);
-    sends(&mut client, 0, &[FIRST, LAST_OF_9]);
-    hears(&mut client, 0, &[acked(2, 127)]);
+    asks(&mut client, 0, &[INITIATE_9], &[granted(127)]);
+    asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(2, 127)]);
     assert_eq!(client.progress(), 9);
-    sends(&mut client, 0, &[END_OF_9]);
-    hears(&mut client, 0, &[ENDED]);
+    asks(&mut client, 0, &[END_OF_9], &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     // A server without CRC; sub-blocks of one segment.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[[0xA0, 0x50, 0x1F, 1, 1, 0, 0, 0]]);
-    sends(&mut client, 0, &[FIRST]);
-    hears(&mut client, 0, &[acked(1, 1)]);
+    asks(&mut client, 0, &[INITIATE_9], &[[0xA0, 0x50, 0x1F, 1, 1, 0, 0, 0]]);
+    asks(&mut client, 0, &[FIRST], &[acked(1, 1)]);
     assert_eq!(client.progress(), 7);
-    sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[acked(1, 1)]);
-    sends(&mut client, 0, &[[0xD5, 0, 0, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[ENDED]);
+    asks(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]], &[acked(1, 1)]);
+    asks(&mut client, 0, &[[0xD5, 0, 0, 0, 0, 0, 0, 0]], &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     // Four bytes need no segment, an empty value one empty segment.
     let mut client = Download::as_blocks(node(), PROGRAM, [1, 2, 3, 4], CONFIG);
     sends(&mut client, 0, &[[0x23, 0x50, 0x1F, 1, 1, 2, 3, 4]]);
     let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG);
-    sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[granted(127)]);
-    sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[acked(1, 127)]);
-    sends(&mut client, 0, &[[0xDD, 0, 0, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[ENDED]);
+    asks(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]], &[granted(127)]);
+    asks(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]], &[acked(1, 127)]);
+    asks(&mut client, 0, &[[0xDD, 0, 0, 0, 0, 0, 0, 0]], &[ENDED]);
     ends(&mut client, 0, &[], Ok(()));
 }
 
 #[test]
 fn client_repeats_what_the_server_did_not_get() {
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[granted(127)]);
-    sends(&mut client, 0, &[FIRST, LAST_OF_9]);
-    hears(&mut client, 0, &[acked(0, 2)]);
-    sends(&mut client, 0, &[FIRST, LAST_OF_9]);
-    hears(&mut client, 0, &[acked(1, 2)]);
-    sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[acked(1, 2)]);
+    asks(&mut client, 0, &[INITIATE_9], &[granted(127)]);
+    asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(0, 2)]);
+    asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(1, 2)]);
+    asks(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]], &[acked(1, 2)]);
     sends(&mut client, 0, &[END_OF_9]);
     // A repeated acknowledgement: after the last segment, in the middle, and before the first
     // segment.
     hears(&mut client, 0, &[acked(1, 2), ENDED]);
     ends(&mut client, 0, &[], Ok(()));
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[granted(1)]);
-    sends(&mut client, 0, &[FIRST]);
-    hears(&mut client, 0, &[acked(1, 1), acked(1, 1)]);
+    asks(&mut client, 0, &[INITIATE_9], &[granted(1)]);
+    asks(&mut client, 0, &[FIRST], &[acked(1, 1), acked(1, 1)]);
     sends(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
     let mut client = Download::as_blocks(node(), PROGRAM, [0; 0], CONFIG);
-    sends(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
-    hears(&mut client, 0, &[granted(127), acked(0, 127)]);
+    asks(&mut client, 0, &[[0xC6, 0x50, 0x1F, 1, 0, 0, 0, 0]], &[granted(127), acked(0, 127)]);
     sends(&mut client, 0, &[[0x81, 0, 0, 0, 0, 0, 0, 0]]);
     // A server that never receives anything is given up.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[granted(127)]);
+    asks(&mut client, 0, &[INITIATE_9], &[granted(127)]);
     for _ in 0..9 {
-        sends(&mut client, 0, &[FIRST, LAST_OF_9]);
-        hears(&mut client, 0, &[acked(0, 127)]);
+        asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(0, 127)]);
     }
-    sends(&mut client, 0, &[FIRST, LAST_OF_9]);
-    hears(&mut client, 0, &[acked(0, 127)]);
+    asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(0, 127)]);
     let given_up = [0x80, 0x50, 0x1F, 1, 0x03, 0x00, 0x04, 0x05];
     ends(&mut client, 0, &[given_up], Err(SdoError::Client(AbortCode(0x0504_0003))));
 }
@@ -526,18 +513,15 @@ fn client_tells_a_server_without_blocks_from_other_refusals() {
     }
     // If the answer comes, it was the abort of the transfer before.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
-    sends(&mut client, 0, &[INITIATE_9]);
-    hears(&mut client, 0, &[misnamed, granted(127)]);
+    asks(&mut client, 0, &[INITIATE_9], &[misnamed, granted(127)]);
     sends(&mut client, 101, &[FIRST, LAST_OF_9]);
 }
 
 #[test]
 fn client_makes_a_block_upload() {
     let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[READ_14]);
-    hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
-    sends(&mut client, 0, &[START]);
-    hears(&mut client, 0, &[FIRST, LAST_OF_14]);
+    asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+    asks(&mut client, 0, &[START], &[FIRST, LAST_OF_14]);
     sends(&mut client, 0, &[acked(2, 127)]);
     // The last segment twice, then the end.
     hears(&mut client, 0, &[LAST_OF_14, END_OF_14]);
@@ -549,8 +533,7 @@ fn client_makes_a_block_upload() {
         let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, block);
         sends(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, blksize, 0, 0, 0]]);
         hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
-        sends(&mut client, 0, &[START]);
-        hears(&mut client, 0, &[FIRST]);
+        asks(&mut client, 0, &[START], &[FIRST]);
         if blksize > 1 {
             hears(&mut client, 0, &[LAST_OF_14]);
         }
@@ -559,20 +542,15 @@ fn client_makes_a_block_upload() {
     // Without size and CRC, in sub-blocks of one.
     let mut client =
         Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, Block { blksize: 1, pst: 20, ..BLOCK });
-    sends(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, 1, 20, 0, 0]]);
-    hears(&mut client, 0, &[[0xC0, 0x00, 0x20, 0, 0, 0, 0, 0]]);
-    sends(&mut client, 0, &[START]);
-    hears(&mut client, 0, &[FIRST]);
-    sends(&mut client, 0, &[acked(1, 1)]);
-    hears(&mut client, 0, &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
-    sends(&mut client, 0, &[acked(1, 1)]);
-    hears(&mut client, 0, &[[0xD5, 0, 0, 0, 0, 0, 0, 0]]);
+    asks(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, 1, 20, 0, 0]], &[[0xC0, 0x00, 0x20, 0, 0, 0, 0, 0]]);
+    asks(&mut client, 0, &[START], &[FIRST]);
+    asks(&mut client, 0, &[acked(1, 1)], &[[0x81, 8, 9, 0, 0, 0, 0, 0]]);
+    asks(&mut client, 0, &[acked(1, 1)], &[[0xD5, 0, 0, 0, 0, 0, 0, 0]]);
     ends(&mut client, 0, &[ENDED], Ok(()));
     assert_eq!(client.into_sink(), nine());
     // A server that answers without blocks.
     let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-    sends(&mut client, 0, &[READ_14]);
-    hears(&mut client, 0, &[[0x4B, 0x00, 0x20, 0, 1, 2, 0, 0]]);
+    asks(&mut client, 0, &[READ_14], &[[0x4B, 0x00, 0x20, 0, 1, 2, 0, 0]]);
     ends(&mut client, 0, &[], Ok(()));
     assert_eq!(client.into_sink(), [1, 2]);
 }
@@ -581,27 +559,22 @@ fn client_makes_a_block_upload() {
 fn client_asks_again_for_what_was_lost() {
     let upload = || {
         let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-        sends(&mut client, 0, &[READ_14]);
-        hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+        asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
         sends(&mut client, 0, &[START]);
         client
     };
     let mut client = upload();
     hears(&mut client, 0, &[LAST_OF_14]);
-    sends(&mut client, 0, &[acked(0, 127)]);
-    hears(&mut client, 0, &[FIRST, LAST_OF_14]);
-    sends(&mut client, 0, &[acked(2, 127)]);
-    hears(&mut client, 0, &[END_OF_14]);
+    asks(&mut client, 0, &[acked(0, 127)], &[FIRST, LAST_OF_14]);
+    asks(&mut client, 0, &[acked(2, 127)], &[END_OF_14]);
     ends(&mut client, 0, &[ENDED], Ok(()));
     assert_eq!(client.into_sink(), (1..=14).collect::<Vec<u8>>());
     // The end of the sub-block is lost.
     let mut client = upload();
     hears(&mut client, 100, &[FIRST]);
     assert_eq!(client.poll(at(399)), Step::Wait(at(400)));
-    sends(&mut client, 400, &[acked(1, 127)]);
-    hears(&mut client, 400, &[[0x81, 8, 9, 10, 11, 12, 13, 14]]);
-    sends(&mut client, 400, &[acked(1, 127)]);
-    hears(&mut client, 400, &[END_OF_14]);
+    asks(&mut client, 400, &[acked(1, 127)], &[[0x81, 8, 9, 10, 11, 12, 13, 14]]);
+    asks(&mut client, 400, &[acked(1, 127)], &[END_OF_14]);
     ends(&mut client, 400, &[ENDED], Ok(()));
     assert_eq!(client.into_sink(), (1..=14).collect::<Vec<u8>>());
     // Everything is lost, or the server is gone.
@@ -656,8 +629,7 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
 
     let upload = |heard: &[[u8; 8]]| {
         let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-        sends(&mut client, 0, &[READ_14]);
-        hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+        asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
         sends(&mut client, 0, &[START]);
         hears(&mut client, 0, heard);
         while let Step::Send(_) = client.poll(at(0)) {}
@@ -682,17 +654,13 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
     // A number above the requested block size.
     let small = Block { blksize: 2, ..BLOCK };
     let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, small);
-    sends(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, 2, 0, 0, 0]]);
-    hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
-    sends(&mut client, 0, &[START]);
-    hears(&mut client, 0, &[[0x03, 1, 2, 3, 4, 5, 6, 7]]);
+    asks(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, 2, 0, 0, 0]], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+    asks(&mut client, 0, &[START], &[[0x03, 1, 2, 3, 4, 5, 6, 7]]);
     refused(&mut client, DOMAIN, 0x0504_0003);
     // A target that is too small.
     let mut bytes = [0; 8];
     let mut client = Upload::as_blocks(node(), DOMAIN, Buffer::new(&mut bytes), CONFIG, BLOCK);
-    sends(&mut client, 0, &[READ_14]);
-    hears(&mut client, 0, &[[0xC4, 0x00, 0x20, 0, 0, 0, 0, 0]]);
-    sends(&mut client, 0, &[START]);
-    hears(&mut client, 0, &[FIRST, [0x02, 8, 9, 10, 11, 12, 13, 14]]);
+    asks(&mut client, 0, &[READ_14], &[[0xC4, 0x00, 0x20, 0, 0, 0, 0, 0]]);
+    asks(&mut client, 0, &[START], &[FIRST, [0x02, 8, 9, 10, 11, 12, 13, 14]]);
     refused(&mut client, DOMAIN, 0x0504_0005);
 }

@@ -13,6 +13,13 @@ fn sends(client: &mut impl Transfer, now: u32, bytes: [u8; 8]) {
     assert_eq!(client.poll(at(now)), Step::Wait(at(now + 1000)));
 }
 
+/// The request that it must send, and the answer at the same time.
+#[track_caller]
+fn asks(client: &mut impl Transfer, now: u32, bytes: [u8; 8], answer: [u8; 8]) {
+    sends(client, now, bytes);
+    client.handle(&response(answer), at(now));
+}
+
 #[track_caller]
 fn ends(client: &mut impl Transfer, now: u32, result: Result<(), SdoError>) {
     assert_eq!(client.poll(at(now)), Step::Done(result));
@@ -60,27 +67,23 @@ fn downloads_up_to_four_bytes_in_one_frame() {
 fn downloads_more_in_segments() {
     let data: Vec<u8> = (1..=16).collect();
     let mut client = download(&data);
-    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 16, 0, 0, 0]);
-    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x21, 0x00, 0x20, 3, 16, 0, 0, 0], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]);
     sends(&mut client, 0, [0x00, 1, 2, 3, 4, 5, 6, 7]);
     assert_eq!(client.progress(), 0);
     client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(0));
     sends(&mut client, 0, [0x10, 8, 9, 10, 11, 12, 13, 14]);
     assert_eq!(client.progress(), 7);
     client.handle(&response([0x30, 0, 0, 0, 0, 0, 0, 0]), at(0));
-    sends(&mut client, 0, [0x0B, 15, 16, 0, 0, 0, 0, 0]);
-    client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x0B, 15, 16, 0, 0, 0, 0, 0], [0x20, 0, 0, 0, 0, 0, 0, 0]);
     ends(&mut client, 0, Ok(()));
     assert_eq!(client.progress(), 16);
 
     // Seven bytes end in a full segment, none in an empty one.
     let mut client = download(&data[..7]);
-    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 7, 0, 0, 0]);
-    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x21, 0x00, 0x20, 3, 7, 0, 0, 0], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]);
     sends(&mut client, 0, [0x01, 1, 2, 3, 4, 5, 6, 7]);
     let mut client = download(&[]);
-    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 0, 0, 0, 0]);
-    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x21, 0x00, 0x20, 3, 0, 0, 0, 0], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]);
     sends(&mut client, 0, [0x0F, 0, 0, 0, 0, 0, 0, 0]);
 }
 
@@ -96,8 +99,7 @@ fn uploads_expedited() {
     ];
     for (bytes, data) in table {
         let mut client = upload();
-        sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
-        client.handle(&response(bytes), at(0));
+        asks(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0], bytes);
         ends(&mut client, 0, Ok(()));
         assert_eq!(client.progress(), data.len() as u32);
         assert_eq!(client.into_sink(), data);
@@ -108,13 +110,10 @@ fn uploads_expedited() {
 fn uploads_segmented() {
     for announce in [[0x41, 0x00, 0x20, 3, 9, 0, 0, 0], [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]] {
         let mut client = upload();
-        sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
-        client.handle(&response(announce), at(0));
-        sends(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0]);
-        client.handle(&response([0x00, 1, 2, 3, 4, 5, 6, 7]), at(0));
+        asks(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0], announce);
+        asks(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0], [0x00, 1, 2, 3, 4, 5, 6, 7]);
         assert_eq!(client.progress(), 7);
-        sends(&mut client, 0, [0x70, 0, 0, 0, 0, 0, 0, 0]);
-        client.handle(&response([0x1B, 8, 9, 0, 0, 0, 0, 0]), at(0));
+        asks(&mut client, 0, [0x70, 0, 0, 0, 0, 0, 0, 0], [0x1B, 8, 9, 0, 0, 0, 0, 0]);
         ends(&mut client, 0, Ok(()));
         assert_eq!(client.into_sink(), (1..=9).collect::<Vec<u8>>());
     }
@@ -125,8 +124,7 @@ fn a_buffer_takes_what_fits_and_no_more() {
     let mut bytes = [0; 4];
     let mut buffer = Buffer::new(&mut bytes);
     let mut client = Upload::new(node(), Address::new(0x1018, 1), &mut buffer, CONFIG);
-    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
-    client.handle(&response([0x43, 0x18, 0x10, 1, 1, 2, 3, 4]), at(0));
+    asks(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x43, 0x18, 0x10, 1, 1, 2, 3, 4]);
     ends(&mut client, 0, Ok(()));
     assert_eq!(buffer.filled(), [1, 2, 3, 4]);
 
@@ -135,15 +133,12 @@ fn a_buffer_takes_what_fits_and_no_more() {
     // Announced...
     let mut bytes = [0; 4];
     let mut client = Upload::new(node(), Address::new(0x1018, 1), Buffer::new(&mut bytes), CONFIG);
-    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
-    client.handle(&response([0x41, 0x18, 0x10, 1, 5, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x41, 0x18, 0x10, 1, 5, 0, 0, 0]);
     aborts(&mut client, 0, out_of_memory, error);
     // ...and not announced.
     let mut client = Upload::new(node(), Address::new(0x1018, 1), Buffer::new(&mut bytes), CONFIG);
-    sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
-    client.handle(&response([0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), at(0));
-    sends(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0]);
-    client.handle(&response([0x01, 1, 2, 3, 4, 5, 6, 7]), at(0));
+    asks(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
+    asks(&mut client, 0, [0x60, 0, 0, 0, 0, 0, 0, 0], [0x01, 1, 2, 3, 4, 5, 6, 7]);
     aborts(&mut client, 0, out_of_memory, error);
 }
 
@@ -156,8 +151,7 @@ fn a_buffer_is_asked_when_the_size_is_announced() {
         let mut bytes = [0; 4];
         let mut buffer = Buffer::new(&mut bytes);
         let mut client = Upload::new(node(), Address::new(0x1018, 1), &mut buffer, CONFIG);
-        sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
-        client.handle(&response([0x41, 0x18, 0x10, 1, announced, 0, 0, 0]), at(0));
+        asks(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x41, 0x18, 0x10, 1, announced, 0, 0, 0]);
         assert_eq!(client.poll(at(0)), Step::Send(request(next)), "{announced}");
     }
 }
@@ -171,8 +165,7 @@ fn an_abort_of_the_server_is_reported() {
     client.handle(&abort, at(0));
     ends(&mut client, 0, error);
     let mut client = download(&[1, 2, 3, 4, 5]);
-    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);
-    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(0));
+    asks(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]);
     sends(&mut client, 0, [0x05, 1, 2, 3, 4, 5, 0, 0]);
     client.handle(&abort, at(0));
     ends(&mut client, 0, error);
@@ -381,8 +374,7 @@ fn an_abort_for_another_object_is_no_answer() {
     }
     // Some servers name no object at all.
     let mut client = upload();
-    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
-    client.handle(&response([0x80, 0, 0, 0, 0, 0, 0x02, 0x06]), at(0));
+    asks(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0], [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
     ends(&mut client, 0, Err(SdoError::Server(AbortCode::NO_OBJECT)));
 }
 

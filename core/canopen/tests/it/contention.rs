@@ -13,6 +13,7 @@ use kit::random::Random;
 trait Scene {
     fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)>;
     fn begin(&mut self, segments: u8);
+    fn sends(&mut self, numbers: impl Iterator<Item = u8>, data: [u8; 7]);
 }
 
 impl Scene for Bench {
@@ -32,8 +33,14 @@ impl Scene for Bench {
     #[track_caller]
     fn begin(&mut self, segments: u8) {
         assert_eq!(self.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(GRANTED)]);
-        for seqno in 1..=segments {
-            assert_eq!(self.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
+        self.sends(1..=segments, [1, 2, 3, 4, 5, 6, 7]);
+    }
+
+    /// Sends segments with these numbers, none of which is answered.
+    #[track_caller]
+    fn sends(&mut self, numbers: impl Iterator<Item = u8>, [a, b, c, d, e, f, g]: [u8; 7]) {
+        for seqno in numbers {
+            assert_eq!(self.ask([seqno, a, b, c, d, e, f, g]), [], "{seqno}");
         }
     }
 }
@@ -63,17 +70,13 @@ fn a_lost_last_segment_is_acknowledged_after_50_ms_and_a_pause_after_250() {
     // Segment 100 is lost, and so is the last one.
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(99);
-    for seqno in 101..=126 {
-        assert_eq!(bench.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
-    }
+    bench.sends(101..=126, [1, 2, 3, 4, 5, 6, 7]);
     assert_eq!(bench.wait(300), [(250, response(acked(99)))]);
     // The last segment of the transfer, in a sub-block that has room for more: 15 bytes are announced.
     for (size, pause) in [(15, 50), (21, 50), (22, 250)] {
         let mut bench = Bench::with(Config::DEFAULT);
         assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, size, 0, 0, 0]), [response(GRANTED)]);
-        for seqno in 1..=2 {
-            assert_eq!(bench.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
-        }
+        bench.sends(1..=2, [1, 2, 3, 4, 5, 6, 7]);
         assert_eq!(bench.wait(300), [(pause, response(acked(2)))], "{size} bytes");
     }
     // On a bus at 10 or 20 kbit/s the short time is doubled.
@@ -81,9 +84,7 @@ fn a_lost_last_segment_is_acknowledged_after_50_ms_and_a_pause_after_250() {
         let mut bench = Bench::with(Config { blksize: 3, bit_rate, ..Config::DEFAULT });
         let granted = [0xA4, 0x50, 0x1F, 1, 3, 0, 0, 0];
         assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(granted)]);
-        for seqno in 1..=2 {
-            assert_eq!(bench.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
-        }
+        bench.sends(1..=2, [1, 2, 3, 4, 5, 6, 7]);
         assert_eq!(bench.wait(300), [(pause, response([0xA2, 2, 3, 0, 0, 0, 0, 0]))], "{bit_rate:?}");
     }
 }
@@ -120,9 +121,7 @@ fn aborted_at(place: u8, second: Option<Channel>) -> Bench {
     bench.device.second = second;
     let [low, high] = (7 * u16::from(place) - 1).to_le_bytes();
     assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, low, high, 0, 0]), [response(GRANTED)]);
-    for seqno in 1..place {
-        assert_eq!(bench.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
-    }
+    bench.sends(1..place, [1, 2, 3, 4, 5, 6, 7]);
     let abort = [0x80, 0x50, 0x1F, 1, 0x10, 0, 0x07, 0x06];
     assert_eq!(bench.ask([place, 1, 2, 3, 4, 5, 6, 7]), [response(abort)]);
     bench.device.events.clear();
@@ -344,9 +343,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(40);
     assert_eq!(bench.wait(260), [(250, response(acked(40)))]);
-    for seqno in 41..=127 {
-        assert_eq!(bench.ask([seqno, 9, 9, 9, 9, 9, 9, 9]), [], "{seqno}");
-    }
+    bench.sends(41..=127, [9, 9, 9, 9, 9, 9, 9]);
     // The same with every frame twice, as CAN may deliver it.
     assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), []);
     assert_eq!(bench.wait(60), []);
@@ -363,9 +360,7 @@ fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
     let mut bench = Bench::with(Config::DEFAULT);
     bench.begin(40);
     assert_eq!(bench.wait(260), [(250, response(acked(40)))]);
-    for seqno in 2..=126 {
-        assert_eq!(bench.ask([seqno, 9, 9, 9, 9, 9, 9, 9]), []);
-    }
+    bench.sends(2..=126, [9, 9, 9, 9, 9, 9, 9]);
     assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), [response(acked(0))]);
 }
 

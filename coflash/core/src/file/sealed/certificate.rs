@@ -1,6 +1,6 @@
 //! Certificates: a root's statement about a key that signs programs.
 
-use seal::wire::{role, CERTIFICATE, CERTIFICATE_MAGIC, CERTIFIED, ED25519};
+use seal::wire::{certificate as at, role, CERTIFICATE, CERTIFICATE_MAGIC, CERTIFIED, ED25519};
 
 use super::key::{PublicKey, SigningKey};
 
@@ -42,16 +42,18 @@ impl Certificate {
     #[must_use]
     pub fn tbs(&self, root: PublicKey) -> [u8; CERTIFIED] {
         let mut bytes = [0; CERTIFIED];
-        let words = [self.epoch, self.vendor_id, self.product_code, self.lowest, self.highest];
-        bytes[..4].copy_from_slice(&CERTIFICATE_MAGIC);
-        bytes[4..6].copy_from_slice(&(CERTIFICATE as u16).to_le_bytes());
-        bytes[6] = self.role as u8;
-        bytes[7] = ED25519 as u8;
-        for (place, word) in bytes[8..28].chunks_exact_mut(4).zip(words) {
-            place.copy_from_slice(&word.to_le_bytes());
-        }
-        bytes[28..60].copy_from_slice(&self.key.bytes());
-        bytes[60..64].copy_from_slice(&root.id().to_le_bytes());
+        let mut put = |at: usize, field: &[u8]| bytes[at..at + field.len()].copy_from_slice(field);
+        put(0, &CERTIFICATE_MAGIC);
+        put(at::SIZE, &(CERTIFICATE as u16).to_le_bytes());
+        put(at::ROLE, &[self.role as u8]);
+        put(at::ALGORITHM, &[ED25519 as u8]);
+        put(at::EPOCH, &self.epoch.to_le_bytes());
+        put(at::VENDOR_ID, &self.vendor_id.to_le_bytes());
+        put(at::PRODUCT_CODE, &self.product_code.to_le_bytes());
+        put(at::LOWEST, &self.lowest.to_le_bytes());
+        put(at::HIGHEST, &self.highest.to_le_bytes());
+        put(at::KEY, &self.key.bytes());
+        put(at::ROOT_ID, &root.id().to_le_bytes());
         bytes
     }
 

@@ -579,7 +579,7 @@ impl<'a> Sealed<'a> {
     fn certificate_field(&self, device: &seal::judge::Device<'_>) -> &'static str {
         let Some(certificate) = self.head.certificate() else { return "it is missing" };
         match () {
-            () if usize::from(certificate.len()) != CERTIFICATE => "its size is impossible",
+            () if usize::from(certificate.size()) != CERTIFICATE => "its size is impossible",
             () if u16::from(certificate.algorithm()) != ED25519 => "its key is for another algorithm",
             () if self.head.program() == BOOTLOADER && certificate.role() != role::BOOTLOADER => {
                 "its key does not sign bootloaders"

@@ -4,8 +4,8 @@
 //! same image, options and key give the same file, byte for byte.
 
 use seal::wire::{
-    flag, tag, Requirements, BOOTLOADER, CERTIFICATE, CERTIFICATE_MAGIC, ED25519, FIXED, FORMAT, HASH, MAGIC,
-    MAX_CHUNK, MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, RESERVED, SIGNATURE, SIGNATURE_HEADER,
+    flag, head, tag, Requirements, BOOTLOADER, CERTIFICATE, CERTIFICATE_MAGIC, ED25519, FIXED, FORMAT, HASH,
+    MAGIC, MAX_CHUNK, MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, RESERVED, SIGNATURE, SIGNATURE_HEADER,
 };
 use seal::wire::{role, Certificate as Wire};
 
@@ -193,25 +193,20 @@ impl Sealer<'_> {
         if size > MAX_MANIFEST {
             return Err(SealFault::Manifest(size));
         }
-        manifest[4..6].copy_from_slice(&(size as u16).to_le_bytes());
+        put(&mut manifest, head::MANIFEST_SIZE, &(size as u16).to_le_bytes());
         // Two different payloads must never have the same key and nonce: if a key stream is used
         // twice, both payloads can be recovered. Therefore everything that goes into the file is an
         // input here.
         let made = hmac(secret, &[KEY_DOMAIN, &manifest, &payload]);
         let image_key: [u8; 32] = seal::wire::array(&made, 0);
         let nonce: [u8; 16] = seal::wire::array(&made, 32);
-        manifest[104..120].copy_from_slice(&nonce);
+        put(&mut manifest, head::NONCE, &nonce);
         if !self.encrypt_for.is_empty() {
             chacha20(&mut payload, &image_key, &nonce);
         }
         let (chain, chunks) = chain(&payload, 1 << self.chunk);
-        manifest[72..104].copy_from_slice(&chain);
-        self.add_records(&mut manifest, &image_key, &nonce);
-        if let Some(requirements) = requirements {
-            manifest.extend_from_slice(&tag::BOOTLOADER.to_le_bytes());
-            manifest.extend_from_slice(&(Requirements::SIZE as u16).to_le_bytes());
-            manifest.extend_from_slice(&requirements.bytes());
-        }
+        put(&mut manifest, head::CHAIN, &chain);
+        self.add_records(&mut manifest, &image_key, &nonce, requirements);
 
         let mut file = manifest;
         if let Some(certificate) = &self.certificate {
@@ -279,7 +274,7 @@ impl Sealer<'_> {
     fn check_certificate(&self, bytes: &[u8; CERTIFICATE], key: PublicKey) -> Result<(), SealFault> {
         let certificate = Wire(bytes);
         let known = bytes.starts_with(&CERTIFICATE_MAGIC)
-            && usize::from(certificate.len()) == CERTIFICATE
+            && usize::from(certificate.size()) == CERTIFICATE
             && u16::from(certificate.algorithm()) == ED25519
             && self.roles().contains(&certificate.role())
             && certificate.reserved() == [0; RESERVED];
@@ -329,25 +324,27 @@ impl Sealer<'_> {
         ];
         let flags = flags.iter().filter(|(set, _)| *set).fold(0, |flags, (_, flag)| flags | flag);
         let mut bytes = vec![0; FIXED];
-        let mut put = |at: usize, field: &[u8]| bytes[at..at + field.len()].copy_from_slice(field);
+        let mut put = |at: usize, field: &[u8]| put(&mut bytes, at, field);
         put(0, &MAGIC);
-        put(6, &[1, flags]);
-        put(8, &self.vendor_id.to_le_bytes());
-        put(12, &self.product_code.to_le_bytes());
-        put(16, &self.version.to_le_bytes());
-        put(20, &self.counter.to_le_bytes());
-        put(24, &[self.program, self.chunk]);
-        put(26, &FORMAT.to_le_bytes());
+        put(head::SIGNATURES, &[1]);
+        put(head::FLAGS, &[flags]);
+        put(head::VENDOR_ID, &self.vendor_id.to_le_bytes());
+        put(head::PRODUCT_CODE, &self.product_code.to_le_bytes());
+        put(head::VERSION, &self.version.to_le_bytes());
+        put(head::COUNTER, &self.counter.to_le_bytes());
+        put(head::PROGRAM, &[self.program]);
+        put(head::CHUNK, &[self.chunk]);
+        put(head::FORMAT, &FORMAT.to_le_bytes());
         // `check` limits the size of the image, and so of the LZMA data, far below 4 GiB.
-        put(28, &(image.len() as u32).to_le_bytes());
-        put(32, &CRC.checksum(image).to_le_bytes());
-        put(36, &(payload as u32).to_le_bytes());
-        put(40, &hash(image));
-        put(120, &self.unique_id);
-        put(132, &self.hardware.to_le_bytes());
-        put(136, &self.created.to_le_bytes());
+        put(head::SIZE, &(image.len() as u32).to_le_bytes());
+        put(head::CRC, &CRC.checksum(image).to_le_bytes());
+        put(head::PAYLOAD, &(payload as u32).to_le_bytes());
+        put(head::IMAGE_HASH, &hash(image));
+        put(head::UNIQUE_ID, &self.unique_id);
+        put(head::HARDWARE, &self.hardware.to_le_bytes());
+        put(head::CREATED, &self.created.to_le_bytes());
         if let Some(base) = self.base {
-            put(144, &hash(base));
+            put(head::DICTIONARY, &hash(base));
         }
         bytes
     }
@@ -377,7 +374,13 @@ impl Sealer<'_> {
         notes + self.encrypt_for.len() * (4 + RECIPIENT)
     }
 
-    fn add_records(&self, manifest: &mut Vec<u8>, image_key: &[u8; 32], nonce: &[u8; 16]) {
+    fn add_records(
+        &self,
+        manifest: &mut Vec<u8>,
+        image_key: &[u8; 32],
+        nonce: &[u8; 16],
+        requirements: Option<Requirements>,
+    ) {
         let mut add = |tag: u16, parts: &[&[u8]]| {
             let size: usize = parts.iter().map(|part| part.len()).sum();
             manifest.extend_from_slice(&tag.to_le_bytes());
@@ -391,6 +394,9 @@ impl Sealer<'_> {
         }
         for (tag, bytes) in self.notes() {
             add(tag, &[&bytes]);
+        }
+        if let Some(requirements) = requirements {
+            add(tag::BOOTLOADER, &[&requirements.bytes()]);
         }
     }
 }
@@ -451,6 +457,11 @@ impl Unsigned {
 fn bootloader_header(image: &[u8]) -> Option<Header> {
     let header = Header::of_bytes(image.first_chunk()?);
     (header.magic == ram_image::MAGIC).then_some(header)
+}
+
+/// Writes a field of the manifest.
+fn put(manifest: &mut [u8], at: usize, field: &[u8]) {
+    manifest[at..at + field.len()].copy_from_slice(field);
 }
 
 /// Cuts payload into chunks: the hash of the first, and all of them.

@@ -269,39 +269,34 @@ fn the_device_tells_which_rule_is_broken() {
     }
 
     // Each of these is what its signer has signed.
-    let cases: [(usize, &[u8], Refusal); 7] = [
+    let found = u32::from_le_bytes(file[32..36].try_into().unwrap());
+    let unequal = "payload and image have different sizes, and it is not compressed";
+    let cases: [(usize, &[u8], Refusal); 12] = [
         (7, &[1 << 2], Refusal::Field("it has an unknown flag")),
         (7, &[1 << 3], Refusal::Field("it has a dictionary but is not compressed")),
         (25, &[14], Refusal::Field("no device accepts chunks of this size")),
         (26, &[2, 0], Refusal::Field("it needs a newer bootloader")),
         (28, &[0; 4], Refusal::Field("it is empty")),
-        (
-            28,
-            &[1, 0, 0, 0],
-            Refusal::Field("payload and image have different sizes, and it is not compressed"),
-        ),
+        (28, &[1, 0, 0, 0], Refusal::Field(unequal)),
         (40, &[0; 32], Refusal::Hash),
+        (32, &[0; 4], Refusal::Crc { found, said: 0 }),
+        (7, &[1 << 6], Refusal::Test),
+        (7, &[1], Refusal::Kek),
+        (72, &[0; 32], Refusal::Chain { number: 1, of: 2 }),
+        (7, &[1 << 1], Refusal::Compression),
     ];
     for (at, field, expected) in cases {
         assert_eq!(refusal(&changed(&file, at, field), &good), expected);
     }
-    let said = u32::from_le_bytes(file[32..36].try_into().unwrap());
-    let wrong = changed(&file, 32, &[0; 4]);
-    assert_eq!(refusal(&wrong, &good), Refusal::Crc { found: said, said: 0 });
-    assert_eq!(refusal(&changed(&file, 7, &[1 << 6]), &good), Refusal::Test);
-    assert_eq!(refusal(&changed(&file, 7, &[1]), &good), Refusal::Kek);
-    assert_eq!(refusal(&changed(&file, 72, &[0; 32]), &good), Refusal::Chain { number: 1, of: 2 });
     assert!(verify(&changed(&file, 7, &[1 << 6]), &Device { for_tests: true, ..good }).is_ok());
-    assert_eq!(refusal(&changed(&file, 7, &[1 << 1]), &good), Refusal::Compression);
 
     // And these are not.
-    let mut wrong = file.clone();
-    wrong[16] ^= 1;
-    assert_eq!(refusal(&wrong, &good), Refusal::Signature(id));
     let last = file.len() - 1;
-    let mut wrong = file.clone();
-    wrong[last] ^= 1;
-    assert_eq!(refusal(&wrong, &good), Refusal::Chain { number: 2, of: 2 });
+    for (at, expected) in [(16, Refusal::Signature(id)), (last, Refusal::Chain { number: 2, of: 2 })] {
+        let mut wrong = file.clone();
+        wrong[at] ^= 1;
+        assert_eq!(refusal(&wrong, &good), expected);
+    }
     assert_eq!(
         refusal(&file[..last], &good),
         Refusal::CutOff { needed: last as u64 + 1, found: last as u64 }

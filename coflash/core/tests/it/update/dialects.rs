@@ -17,12 +17,8 @@ use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Re
 use coflash_core::Error;
 use embedded_can::Frame as _;
 
-<<<<<<< HEAD
-use super::left;
-use kit::fake::lift::{Kept, Lift, LIFT, NOT_NOW, NO_OBJECT, PHRASE, RANGE};
-=======
 use super::{file, left};
->>>>>>> 43ae2e16 (Tests of updates share one set-up, and one adapter with a test in between)
+use kit::fake::lift::{Kept, Lift, LIFT, NOT_NOW, NO_OBJECT, PHRASE, RANGE};
 use kit::fake::{Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// "BOOT" (ESAcademy), and what older lift bootloaders have.

@@ -37,7 +37,7 @@ impl SdoServer {
     ) -> Result<(), AbortCode> {
         let at = fields::address(bytes);
         let data_type = self.writable(at, objects)?.data_type;
-        let size = (bytes[0] & fields::BLOCK_SIZE_TOLD != 0).then(|| fields::number(bytes));
+        let size = (bytes[0] & fields::BLOCK_SIZE_INDICATED != 0).then(|| fields::number(bytes));
         let incoming = Incoming::start(at, data_type, size, objects)?;
         let receiver = Receiver::new(bytes[0] & fields::CRC != 0);
         self.forget_under_way();

@@ -40,8 +40,8 @@ impl SdoServer {
             return Ok(());
         }
         self.state = State::BlockUpload { outgoing, sender: Sender::new(blksize) };
-        let told = if size.is_some() { fields::BLOCK_SIZE_TOLD } else { 0 };
-        let command = scs::INITIATE_BLOCK_UPLOAD | fields::CRC | told;
+        let indicated = if size.is_some() { fields::BLOCK_SIZE_INDICATED } else { 0 };
+        let command = scs::INITIATE_BLOCK_UPLOAD | fields::CRC | indicated;
         self.answer_initiate(command, size.unwrap_or(0));
         Ok(())
     }

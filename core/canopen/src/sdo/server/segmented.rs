@@ -15,9 +15,9 @@ impl SdoServer {
         let at = fields::address(bytes);
         let data_type = self.writable(at, objects)?.data_type;
         let command = bytes[0];
-        let size_told = command & fields::SIZE_TOLD != 0;
+        let is_size_indicated = command & fields::SIZE_INDICATED != 0;
         let expedited = command & fields::EXPEDITED != 0;
-        let size = match (expedited, size_told) {
+        let size = match (expedited, is_size_indicated) {
             (true, true) => Some(4 - u32::from(fields::unused_of_4(command))),
             // The frame does not give the number of data bytes among the four; the type does.
             (true, false) => Some(data_type.size().unwrap_or(4).min(4)),
@@ -69,12 +69,12 @@ impl SdoServer {
         let command = match outgoing.size() {
             Some(size @ 1..=4) if !outgoing.is_domain() => {
                 data[..size as usize].copy_from_slice(&self.value[..size as usize]);
-                scs::INITIATE_UPLOAD | (4 - size as u8) << 2 | fields::EXPEDITED | fields::SIZE_TOLD
+                scs::INITIATE_UPLOAD | (4 - size as u8) << 2 | fields::EXPEDITED | fields::SIZE_INDICATED
             }
             size => {
                 self.state = State::Upload { outgoing, toggle: false };
                 data = size.unwrap_or(0).to_le_bytes();
-                scs::INITIATE_UPLOAD | if size.is_some() { fields::SIZE_TOLD } else { 0 }
+                scs::INITIATE_UPLOAD | if size.is_some() { fields::SIZE_INDICATED } else { 0 }
             }
         };
         self.answer_initiate(command, u32::from_le_bytes(data));
