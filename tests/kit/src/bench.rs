@@ -61,6 +61,11 @@ pub const DEVICE: Device = Device {
     serial_number: 0,
 };
 
+/// The empty flash of a new device, for a test that does not read it beside the device.
+pub fn new_flash() -> &'static mut ModelFlash {
+    Box::leak(Box::new(ModelFlash::new(&CHIP)))
+}
+
 pub struct Bench<'f> {
     pub node: Bootloader<'static, &'f mut ModelFlash, Journal, 1>,
 }

@@ -8,8 +8,8 @@ use canopen::od::{Address, Objects};
 use canopen::program::FlashError;
 use canopen::AbortCode;
 use kit::bench::{
-    autostart, block, block_file, cut_at_every_operation, program, Bench, CLEAR, IDENTIFICATION, LAYOUT,
-    SET_SIGNATURE, START,
+    autostart, block, block_file, cut_at_every_operation, new_flash, program, Bench, CLEAR, IDENTIFICATION,
+    LAYOUT, SET_SIGNATURE, START,
 };
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::block_file::Control;
@@ -229,8 +229,7 @@ fn a_products_own_check_sees_the_label() {
             _ => Verdict::Standard,
         }
     }
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with_buffer(&mut flash, Policy { check: no_downgrade, ..POLICY }, 2048);
+    let mut bench = Bench::with_buffer(new_flash(), Policy { check: no_downgrade, ..POLICY }, 2048);
     for (version, outcome) in [(7, (Err(UNFIT), 0x7E)), (8, (Ok(()), 0))] {
         let image = labelled(NEW, &Label::dated(DEVICE.0, DEVICE.1, version, TODAY));
         assert_eq!(bench.command(CLEAR), 0);

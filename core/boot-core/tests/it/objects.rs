@@ -4,7 +4,7 @@
 use std::ops::RangeInclusive;
 use std::task::Poll;
 
-use boot_core::bootloader::{Bootloader, Choices, Config, Extras};
+use boot_core::bootloader::{Bootloader, Choices, Config, Everything, Extras};
 use boot_core::control::{Policy, Step};
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
@@ -15,7 +15,7 @@ use canopen::od::{Address, Objects};
 use canopen::program::ProgramStart;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
-use kit::bench::{Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, SET_SIGNATURE, START};
+use kit::bench::{new_flash, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, SET_SIGNATURE, START};
 use kit::boot::{leaked, Boot};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
@@ -116,13 +116,17 @@ fn each_program_has_its_own_values_and_no_other_exists() {
         }
         rig.reset();
     }
+    rig.chip.model().touched.clear();
     for number in [0, 3, 254, 255] {
-        assert_eq!(rig.command(number, START), Err(NO_SUB_INDEX), "{number}");
+        for command in [START, CLEAR] {
+            assert_eq!(rig.command(number, command), Err(NO_SUB_INDEX), "{number}");
+        }
         assert_eq!(rig.begin(number, None, &[]), Err(NO_SUB_INDEX), "{number}");
         assert_eq!(rig.node.upload_start(Address::new(0x1F50, number)), Err(NO_SUB_INDEX), "{number}");
         assert_eq!((rig.state(number), rig.word(0x2005, number)), (3, 0), "{number}");
         assert_eq!(read(&mut rig, 0x2004, number), Ok(vec![0; 8]), "{number}");
     }
+    assert_eq!(rig.chip.model().touched, []);
 }
 
 /// The label must lie inside the program: bytes after it are none of its own.
@@ -396,6 +400,41 @@ fn a_device_that_stores_nothing_says_so() {
     assert!(flash.touched.is_empty());
 }
 
+/// A master that writes an object of an update is at work, whatever comes of it: the device waits for it. For
+/// another object it does not.
+#[test]
+fn who_writes_an_object_of_an_update_holds_the_device() {
+    let cases: [(u16, u8, &[u8], bool); 8] = [
+        (0x1F51, 1, &[CLEAR], true),
+        (0x1F51, 1, &[0x55], true),
+        (0x6005, 1, b"wrong", true),
+        (0x7F50, 1, &[0; 4], true),
+        (0x2002, 2, &[0; 4], true),
+        (0x2008, 0, b"none", true),
+        (0x1201, 1, &[0; 4], false),
+        (0x1014, 0, &[0; 4], false),
+    ];
+    for (index, sub, data, holds) in cases {
+        let mut node = with_choices::<Everything>(new_flash());
+        assert!(!node.is_asked());
+        let _ = node.write(Address::new(index, sub), data);
+        assert_eq!(node.is_asked(), holds, "{index:04X}h");
+    }
+    let mut node = with_choices::<Everything>(new_flash());
+    let _ = node.download_start(Address::new(0x1F50, 1), None);
+    assert!(node.is_asked());
+}
+
+/// A bootloader with this report of the boot stage.
+fn reported(
+    flash: &mut ModelFlash,
+    config: &'static Config,
+    report: BootReport,
+) -> Bootloader<'static, &mut ModelFlash, Journal, 1> {
+    let (buffer, sealed) = leaked(256);
+    Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), report }.on(flash, buffer, sealed)
+}
+
 /// A bootloader of a product with these choices.
 fn with_choices<C: Choices>(flash: &mut ModelFlash) -> Bootloader<'static, &mut ModelFlash, Journal, 1, C> {
     let parameters = Journal::open(flash, CONFIG.layout.parameters);
@@ -445,12 +484,8 @@ fn the_end_of_work_is_told_by_an_emergency() {
 #[test]
 fn a_device_tells_why_it_stayed() {
     let messages = |reason: u8, boot_up_emergency| {
-        let mut flash = ModelFlash::new(&CHIP);
         let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
-        let (buffer, sealed) = leaked(256);
-        let report = BootReport { reason, ..BootReport::NONE };
-        let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), report };
-        let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
+        let mut node = reported(new_flash(), config, BootReport { reason, ..BootReport::NONE });
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
         let mut bytes = [0; 4];
@@ -479,16 +514,13 @@ fn a_device_tells_why_it_stayed() {
 /// 2007h: what the boot stage reported.
 #[test]
 fn the_state_of_the_device_is_what_the_boot_stage_reported() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let (buffer, sealed) = leaked(256);
     let report = BootReport {
         reason: Reason::Unsigned as u8,
         program_reset: ResetCause::IndependentWatchdog as u8,
         crash_resets: 3,
         ..BootReport::NONE
     };
-    let boot = Boot { config: &CONFIG, serial_number: 0, node: kit::bench::node(), report };
-    let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
+    let mut node = reported(new_flash(), &CONFIG, report);
     for (sub, value) in [(1, 0), (2, 5), (3, 4), (4, 3)] {
         let mut byte = [0xEE];
         assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
@@ -514,10 +546,8 @@ fn a_start_that_the_boot_stage_refused_is_no_valid_program() {
             let mut rig = Rig::new(&STANDARD_1, 4096);
             rig.install(1, &raw(&STANDARD_1, 1, 700));
             let mut flash = rig.chip.model().clone();
-            let (buffer, sealed) = leaked(256);
             let report = BootReport { reason: reason as u8, refused, ..BootReport::NONE };
-            let boot = Boot { report, ..Boot::new(&CONFIG, kit::bench::node()) };
-            let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
+            let mut node = reported(&mut flash, &CONFIG, report);
             let mut read = |index| {
                 let mut bytes = [0; 4];
                 node.read(Address::new(index, 1), &mut bytes).unwrap();
@@ -536,8 +566,7 @@ fn a_start_that_the_boot_stage_refused_is_no_valid_program() {
 /// clause 7.3.2.2.1).
 #[test]
 fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_reset() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with_config(&mut flash, CONFIG, 256);
+    let mut bench = Bench::with_config(new_flash(), CONFIG, 256);
     let fresh = bench.node.second_server();
     let at = |sub| Address::new(0x1201, sub);
     bench.node.write(at(1), &0x0000_06A0_u32.to_le_bytes()).unwrap();
@@ -562,8 +591,7 @@ fn what_a_product_does_without_is_not_there() {
         const BLOCK_DOWNLOAD: bool = false;
         const BLOCK_UPLOAD: bool = false;
     }
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut least = with_choices::<Least>(&mut flash);
+    let mut least = with_choices::<Least>(new_flash());
     let channel = least.second_server();
     assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
     assert_eq!(least.second_server(), channel);
@@ -668,8 +696,7 @@ fn data_of_the_application_are_any_bytes() {
 /// The steps of a device that has nothing to do.
 #[test]
 fn an_idle_device_stays_idle() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with(&mut flash, Policy { read_back: true, ..Policy::DEFAULT });
+    let mut bench = Bench::with(new_flash(), Policy { read_back: true, ..Policy::DEFAULT });
     assert_eq!(bench.node.step(), Step::Idle);
     assert!(!bench.node.busy() && !bench.node.is_finishing());
     bench.node.write(CONTROL, &[CLEAR]).unwrap();
@@ -685,16 +712,18 @@ fn an_idle_device_stays_idle() {
 
 // --- confirmation, the queue's room, and where a block may lie
 
+/// The stored record of program 1.
+fn record(bench: &mut Bench<'_>) -> Option<ProgramRecord> {
+    let flash = bench.node.flash();
+    ProgramRecord::load(&Journal::open(flash, kit::bench::LAYOUT.parameters), flash, 1)
+}
+
 /// Only the confirmation marks a program that has returned the device; it is stored once.
 #[test]
 fn a_program_that_came_back_is_confirmed_once() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    let confirmed = |bench: &mut Bench<'_>| {
-        let flash = bench.node.flash();
-        let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
-        ProgramRecord::load(&journal, flash, 1).map(|record| record.confirmed)
-    };
+    let confirmed = |bench: &mut Bench<'_>| record(bench).map(|record| record.confirmed);
     bench.node.confirm(1);
     bench.settle();
     assert_eq!(confirmed(&mut bench), None, "there is no program");
@@ -729,10 +758,10 @@ fn a_busy_device_confirms_nothing() {
     bench.node.confirm(1);
     bench.settle();
     assert_eq!(bench.node.stored(), Poll::Ready(Ok(())));
+    assert!(!record(&mut bench).unwrap().confirmed);
     let flash = bench.node.flash();
     let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
     assert_eq!(journal.get(flash, Key::NODE).map(|[id, ..]| id), Some(9));
-    assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
 }
 
 /// Both change the record: the second would be written from what the first has replaced. To start
@@ -750,17 +779,14 @@ fn a_signature_waits_for_a_confirmation() {
     bench.settle();
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
-    let flash = bench.node.flash();
-    let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
-    let record = ProgramRecord::load(&journal, flash, 1).unwrap();
+    let record = record(&mut bench).unwrap();
     assert!(record.confirmed && record.signed);
 }
 
 /// CiA 301 table 26: 8120h, error passive.
 #[test]
 fn an_event_of_the_line_is_told() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
+    let mut bench = Bench::new(new_flash());
     bench.node.line_event(LineEvent::Passive);
     assert_eq!(bench.node.next_emergency(), Some([0x20, 0x81, 0x11, 0, 0, 0, 0, 0]));
 }

@@ -22,6 +22,12 @@ static SMALL: Geometry = Geometry {
 };
 const REGIONS: [Region; 2] = [Region::new(0x0800_0100, 256), Region::new(0x0800_0200, 256)];
 
+fn empty() -> (ModelFlash, Journal) {
+    let flash = ModelFlash::new(&SMALL);
+    let journal = Journal::open(&flash, REGIONS);
+    (flash, journal)
+}
+
 fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) -> Result<(), StoreError> {
     journal.store(key, value);
     run(flash, |flash, outcome| journal.next(flash, outcome))
@@ -29,8 +35,7 @@ fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) 
 
 #[test]
 fn values_survive_a_restart_and_any_number_of_compactions() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     assert_eq!(journal.get(&flash, Key::CRASH_COUNT), None);
     for i in 0..200 {
         store(&mut flash, &mut journal, Key::program(1 + (i % 3) as u8), [i, !i, i * 7, 0]).unwrap();
@@ -129,8 +134,7 @@ fn noise_in_both_regions_is_an_empty_journal() {
 #[test]
 fn errors_of_the_flash_are_told_and_the_old_value_stays() {
     for operation in 1..=7 {
-        let mut flash = ModelFlash::new(&SMALL);
-        let mut journal = Journal::open(&flash, REGIONS);
+        let (mut flash, mut journal) = empty();
         store(&mut flash, &mut journal, Key::program(1), [1; 4]).unwrap();
         flash.fail = Some((flash.operations + operation, FlashFault::Protected));
         let outcome = store(&mut flash, &mut journal, Key::program(1), [2; 4]);
@@ -204,8 +208,7 @@ fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
 #[test]
 #[should_panic(expected = "flash was read while it is busy")]
 fn a_store_that_is_asked_while_the_flash_works_is_caught() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     store(&mut flash, &mut journal, Key::CRASH_COUNT, [1; 4]).unwrap();
     flash.start(Operation::Program { address: 0x0800_0300, word: 0 }).unwrap();
     let _ = journal.get(&flash, Key::CRASH_COUNT);
@@ -234,8 +237,7 @@ fn used(flash: &ModelFlash, region: Region, slots: usize) -> &[u8] {
 /// docs/adr/0004: a device in the field is read by every later bootloader.
 #[test]
 fn the_first_values_stand_behind_a_header_in_the_first_region() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     store(&mut flash, &mut journal, Key::NODE, [5, 1, 0, 0]).unwrap();
     store(&mut flash, &mut journal, Key::CRASH_COUNT, [2, 0, 0, 0]).unwrap();
     let expected = [header(1), record(Key::NODE, [5, 1, 0, 0]), record(Key::CRASH_COUNT, [2, 0, 0, 0])];
@@ -256,8 +258,7 @@ fn the_tags_are_those_of_devices_in_the_field() {
 /// change of the region.
 #[test]
 fn an_unknown_key_is_as_good_as_any_other() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     let unknown = [Key(0x0077_0001), Key(0xFFFF_FFFE), Key(0)];
     for (number, key) in (1..).zip(unknown) {
         store(&mut flash, &mut journal, key, [number; 4]).unwrap();
@@ -275,8 +276,7 @@ fn an_unknown_key_is_as_good_as_any_other() {
 /// 256 bytes are nine slots: a header and eight records. The ninth record needs the other region.
 #[test]
 fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     let stores = [
         (Key::NODE, [5, 1, 0, 0]),
         (Key::program(1), [1; 4]),
@@ -406,8 +406,7 @@ fn a_header_or_a_record_with_any_wrong_bit_does_not_count() {
 #[test]
 fn a_header_without_its_mark_is_written_again_before_anything_is_added() {
     for (full, marked) in (1..8).flat_map(|full| [(full, false), (full, true)]) {
-        let mut flash = ModelFlash::new(&SMALL);
-        let mut journal = Journal::open(&flash, REGIONS);
+        let (mut flash, mut journal) = empty();
         for n in 0..full {
             store(&mut flash, &mut journal, Key::NODE, [n, 1, 0, 0]).unwrap();
         }
@@ -436,8 +435,7 @@ fn a_header_without_its_mark_is_written_again_before_anything_is_added() {
 #[test]
 fn a_value_that_is_stored_already_is_not_written_again() {
     for others in 0..12 {
-        let mut flash = ModelFlash::new(&SMALL);
-        let mut journal = Journal::open(&flash, REGIONS);
+        let (mut flash, mut journal) = empty();
         store(&mut flash, &mut journal, Key::NODE, [5, 1, 0, 0]).unwrap();
         for n in 0..others {
             store(&mut flash, &mut journal, Key::CRASH_COUNT, [n, 0, 0, 0]).unwrap();
@@ -465,8 +463,7 @@ fn a_store_after_a_power_cut_makes_its_value_certain() {
     // The change is the last slot of a region, or the first one behind a compaction.
     for full in 1..8 {
         let before = || {
-            let mut flash = ModelFlash::new(&SMALL);
-            let mut journal = Journal::open(&flash, REGIONS);
+            let (mut flash, mut journal) = empty();
             for n in 0..full {
                 store(&mut flash, &mut journal, Key::CRASH_COUNT, [n, 0, 0, 0]).unwrap();
             }
@@ -729,8 +726,7 @@ fn a_store_tries_nine_places() {
 /// A store ends, whatever the flash does, and the value before it stays.
 #[test]
 fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
+    let (mut flash, mut journal) = empty();
     store(&mut flash, &mut journal, Key::NODE, [1; 4]).unwrap();
     let before = flash.operations;
     // After the header and the first record, and all of the other region.
@@ -765,8 +761,7 @@ fn a_device_whose_regions_are_worn_out_stores_nothing_and_says_so() {
 fn node_id_and_bit_rate_are_read_if_the_firmware_knows_them() {
     let board = NodeParameters { id: NodeId::new(42), bit_rate: BitRate::K500 };
     let load = |value: Option<Value>, supports: fn(BitRate) -> bool| {
-        let mut flash = ModelFlash::new(&SMALL);
-        let mut journal = Journal::open(&flash, REGIONS);
+        let (mut flash, mut journal) = empty();
         if let Some(value) = value {
             store(&mut flash, &mut journal, Key::NODE, value).unwrap();
         }

@@ -83,10 +83,7 @@ impl Board {
 
     fn install_program(&mut self, size: usize) {
         let mut node = self.start();
-        node.command(1, CLEAR);
-        for block in block_file_at(&program_of(size), PROGRAM.base, 200) {
-            node.send(1, &block).unwrap();
-        }
+        node.download(size);
         assert_eq!(node.command(1, CONFIRM), 0);
         self.leave(None);
     }
@@ -202,7 +199,21 @@ impl Node<'_> {
     fn command(&mut self, program: u8, command: u8) -> u32 {
         self.try_command(program, command).unwrap();
         self.settle();
+        self.status(program)
+    }
+
+    fn status(&mut self, program: u8) -> u32 {
         u32::from_le_bytes(self.read(0x1F57, program))
+    }
+
+    /// CLEAR, and a program of this size in block files.
+    fn download(&mut self, size: usize) {
+        assert_eq!(self.command(1, CLEAR), 0);
+        self.send_all(1, block_file_at(&program_of(size), PROGRAM.base, 200));
+    }
+
+    fn send_all<B: AsRef<[u8]>>(&mut self, program: u8, blocks: impl IntoIterator<Item = B>) {
+        blocks.into_iter().for_each(|block| self.send(program, block.as_ref()).unwrap());
     }
 
     fn send(&mut self, program: u8, block: &[u8]) -> Result<(), AbortCode> {
@@ -413,10 +424,7 @@ fn a_trial_without_its_image_ends_too() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
     let mut board = Board::on_trial(&old, &new);
     let mut node = board.start();
-    assert_eq!(node.command(1, CLEAR), 0);
-    for block in block_file_at(&program_of(0x3400), PROGRAM.base, 200) {
-        node.send(1, &block).unwrap();
-    }
+    node.download(0x3400);
     assert_eq!((node.progress().state, node.progress().origin), (State::None, Origin::Trial));
     // Bits 1 to 7 of 1F57h: 1, no valid program (CiA 302-3).
     assert_eq!(node.command(N, CONFIRM), 1 << 1);
@@ -433,10 +441,7 @@ fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
     let mut board = Board::on_trial(&old, &new);
     let mut node = board.start();
     assert_eq!((node.command(N, CONFIRM), node.progress().state), (0, State::Installed));
-    assert_eq!(node.command(1, CLEAR), 0);
-    for block in block_file_at(&program_of(0x3400), PROGRAM.base, 200) {
-        node.send(1, &block).unwrap();
-    }
+    node.download(0x3400);
     assert_eq!(node.progress().state, State::None);
     node.0.set_time(Instant::from_millis(200_000));
     assert_eq!((node.command(N, CLEAR), node.0.take_boot_request()), (0, None));
@@ -473,9 +478,7 @@ fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x1000), PROGRAM.base, 200);
     let (last, first) = file.split_last().unwrap();
-    for block in first {
-        node.send(1, block).unwrap();
-    }
+    node.send_all(1, first);
     assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE));
     assert_eq!(node.word(0x1F57), BUSY);
     node.send(1, last).unwrap();
@@ -492,16 +495,14 @@ fn a_program_whose_way_into_staging_cannot_be_stored_is_told() {
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x3400), PROGRAM.base, 200);
     let reaches = (STAGING.base - PROGRAM.base) as usize / 200;
-    for block in &file[..reaches] {
-        node.send(1, block).unwrap();
-    }
+    node.send_all(1, &file[..reaches]);
     // Both sectors of the journal.
     node.0.flash().protected = vec![1, 2];
     for block in &file[reaches..reaches + 3] {
         let _ = node.push(1, block);
         node.settle();
     }
-    assert_ne!(u32::from_le_bytes(node.read(0x1F57, 1)) >> 1 & 0x7F, 0, "an error of the program");
+    assert_ne!(node.status(1) >> 1 & 0x7F, 0, "an error of the program");
     assert!(node.has_staged(&new) && node.progress().state == State::Staged);
 }
 
@@ -515,9 +516,7 @@ fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
     let mut file = block_file_at(&program_of(0x3700), PROGRAM.base, 200);
     // With a size: it could go on.
     file[0] = bench::block(0, 0, &[0x3700_u32, 0, 0].map(u32::to_le_bytes).concat());
-    for block in &file[..file.len() - 5] {
-        node.send(1, block).unwrap();
-    }
+    node.send_all(1, &file[..file.len() - 5]);
     // An image that is refused takes nothing from it.
     let wrong = image_of(Header { board: !BOARD, ..SOUND }, 0x280, 3, true);
     let _ = node.send(N, &wrong);
@@ -560,7 +559,7 @@ fn a_program_that_reaches_into_staging_takes_it() {
             }
         }
         assert!(removed_at.is_some());
-        assert_eq!(u32::from_le_bytes(node.read(0x1F57, 1)), 0);
+        assert_eq!(node.status(1), 0);
         assert_eq!(node.command(1, CONFIRM), 0);
         // Now there is no room for an image.
         assert_eq!(node.command(N, CLEAR), 0);
@@ -631,7 +630,7 @@ fn a_spare_is_kept_until_home_is_repaired() {
             };
             let _ = node.try_command(program, CLEAR);
             assert_eq!(node.send(program, &image[0]), Err(AbortCode::DEVICE_STATE), "{after}: {program}");
-            assert_eq!(u32::from_le_bytes(node.read(0x1F57, program)), BUSY, "{after}: {program}");
+            assert_eq!(node.status(program), BUSY, "{after}: {program}");
         }
         assert_eq!(node.command(N, CONFIRM), 0, "83h tries again");
         assert_eq!(board.flash.cells(HOME)[..new.len()], new);
@@ -688,9 +687,7 @@ fn an_installation_is_busy_to_its_end() {
         let mut node = board.start();
         if downloads {
             assert_eq!(node.command(1, CLEAR), 0);
-            for block in &block_file_at(&program_of(0x1000), PROGRAM.base, 200)[..3] {
-                node.send(1, block).unwrap();
-            }
+            node.send_all(1, &block_file_at(&program_of(0x1000), PROGRAM.base, 200)[..3]);
         }
         node.try_command(N, CONFIRM).unwrap();
         while node.progress().state != State::Installed {
@@ -809,11 +806,11 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
     assert_eq!(node.command(N, CONFIRM), 0x0A);
     assert_eq!(node.progress().state, State::Confirmed);
     assert_eq!(node.try_command(1, CLEAR), Err(AbortCode::DEVICE_STATE));
-    assert_eq!(u32::from_le_bytes(node.read(0x1F57, 1)), BUSY);
+    assert_eq!(node.status(1), BUSY);
     let first = &block_file_at(&new, HOME.base, 200)[0];
     for program in [1, N] {
         assert_eq!(node.send(program, first), Err(AbortCode::DEVICE_STATE), "{program}");
-        assert_eq!(u32::from_le_bytes(node.read(0x1F57, program)), BUSY);
+        assert_eq!(node.status(program), BUSY);
     }
     // A second 83h tries again.
     assert_eq!(node.command(N, CONFIRM), 0);

@@ -76,8 +76,7 @@ fn hex_is_stored_whatever_its_records_and_line_ends_are() {
 /// A record for which the device can never have room: refused without a wait.
 #[test]
 fn a_record_that_is_larger_than_half_the_queue_is_refused() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     let text = hex(&program(300, 0), 100, "\n");
     assert_eq!(bench.stream(text.as_bytes(), None, 7), (Err(AbortCode(0x0504_0005)), 0x04));
     assert_eq!(bench.stream(hex(&program(300, 0), 64, "\n").as_bytes(), None, 7), (Ok(()), 0));
@@ -124,8 +123,7 @@ fn a_program_is_fresh_only_right_behind_a_stream() {
     assert_eq!(bench.node.write(CONTROL, &[START]), Err(AbortCode(0x0800_0022)), "it leaves");
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     bench.install(&image);
     assert_eq!(bench.command(START), 0);
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
@@ -181,8 +179,7 @@ fn a_profile_may_start_always_or_by_itself_or_want_a_signature() {
 fn start_right_behind_the_last_segment_waits_for_the_verification() {
     let image = program(2000, 0x66);
     for command in [START, RESET_STAT] {
-        let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = cleared(&mut flash);
+        let mut bench = cleared(new_flash());
         assert_eq!(bench.pour(&image, None, 7), Ok(()));
         assert_eq!(bench.status(), 1, "busy");
         assert!(bench.node.is_finishing(), "a reset now would lose the program");
@@ -193,8 +190,7 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
         assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
     }
     // A program that fails the verification does not start.
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     assert_eq!(bench.pour(&image, None, 7), Ok(()));
     assert_eq!(bench.node.write(CONTROL, &[START]), Ok(()));
     let operations = bench.node.flash().operations;
@@ -309,8 +305,7 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
 fn a_place_that_is_written_twice_is_not_blank() {
     let image = program(600, 0xA0);
     let text = hex(&image, 16, "\n").replace(EOF, &(record(0x0900, 0, &[0]) + EOF));
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     assert_eq!(bench.stream(text.as_bytes(), None, 7), (Ok(()), 0x08), "NOTCLEARED");
     assert_eq!(bench.command(START), 2, "NOVALPROG");
     assert_eq!(bench.command(CLEAR), 0);
@@ -320,8 +315,7 @@ fn a_place_that_is_written_twice_is_not_blank() {
 #[test]
 fn a_client_that_breaks_off_leaves_no_program() {
     let image = program(3000, 0xA1);
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     // Before a piece is complete nothing is lost, and the download may begin again at once.
     bench.begin(&image[..14]);
     bench.node.download_cancel(DATA);
@@ -392,8 +386,7 @@ fn stop_counts_as_clear_for_one_download_in_one_transfer() {
 /// Data of the application, which are any bytes, come in one transfer.
 #[test]
 fn stop_counts_as_clear_for_data() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with(&mut flash, Policy { data: Some(1), ..Policy::DEFAULT });
+    let mut bench = Bench::with(new_flash(), Policy { data: Some(1), ..Policy::DEFAULT });
     assert_eq!(bench.stream(b"first", None, 7), (Ok(()), 0));
     assert_eq!(bench.stream(b"second", None, 7), (Err(STATE), 0x08));
     assert_eq!(bench.command(0x00), 0x08);
@@ -405,8 +398,7 @@ fn stop_counts_as_clear_for_data() {
 fn two_formats_in_one_session_are_refused() {
     let image = program(600, 0xB2);
     let blocks = block_file(&image, 96);
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = cleared(new_flash());
     bench.good(&blocks[0]);
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x88));
     assert_eq!(bench.stream(hex(&image, 16, "\n").as_bytes(), None, 7), (Err(STATE), 0x88));
@@ -424,8 +416,7 @@ fn two_formats_in_one_session_are_refused() {
 fn the_flash_fails_under_a_stream() {
     let image = program(3000, 0xC3);
     let fault = |operation: u32| {
-        let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = cleared(&mut flash);
+        let mut bench = cleared(new_flash());
         let before = bench.node.flash().operations;
         bench.node.flash().fail = Some((before + operation, FlashFault::Failed));
         let (outcome, status) = bench.stream(&image, None, 7);

@@ -4,7 +4,7 @@ use boot_core::canopen::lss::StoreError;
 use boot_core::control::Policy;
 use canopen::od::{Address, Objects};
 use canopen::{AbortCode, NodeId};
-use kit::bench::{Bench, SET_SIGNATURE};
+use kit::bench::{new_flash, Bench, SET_SIGNATURE};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
     block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
@@ -160,8 +160,7 @@ fn the_device_says_what_its_supply_and_its_option_bytes_are() {
 /// 5000h is for the supply alone: a product that forbids programming refuses a file with the same status.
 #[test]
 fn a_refusal_for_another_reason_is_no_fault_of_the_hardware() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with(&mut flash, Policy { allowed: || false, ..Policy::DEFAULT });
+    let mut bench = Bench::with(new_flash(), Policy { allowed: || false, ..Policy::DEFAULT });
     let (refused, status) = bench.stream(&kit::bench::program(300, 1), None, 7);
     assert_eq!((refused, status), (Err(AbortCode::DEVICE_STATE), 0x84));
     let emergencies: Vec<_> = std::iter::from_fn(|| bench.node.next_emergency()).collect();
