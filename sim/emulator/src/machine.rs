@@ -805,13 +805,6 @@ impl Machine {
         let cause = crate::cortex::scs::cause(scs.cfsr, scs.hfsr, scs.bfar);
         format!("{cause}; pc {:08X}h", self.pc())
     }
-
-    /// CFSR and HFSR: why a fault was taken.
-    #[must_use]
-    pub fn fault_status(&self) -> (u32, u32) {
-        let scs = &self.cpu.chip().scs;
-        (scs.cfsr, scs.hfsr)
-    }
 }
 
 fn port_index(port: char) -> Option<usize> {

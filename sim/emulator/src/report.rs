@@ -46,17 +46,23 @@ pub struct Report {
     pub count: u64,
 }
 
+impl Report {
+    /// The access and its fault, without time and count.
+    #[must_use]
+    pub fn words(&self) -> String {
+        let Self { access, size, address, pc, what, .. } = self;
+        let value = if *access == Access::Write { format!(" = {:X}h", self.value) } else { String::new() };
+        format!("{access} of {size} bytes at {address:08X}h{value}, pc {pc:08X}h: {what}")
+    }
+}
+
 impl std::fmt::Display for Report {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}: {} of {} at {:08X}h", self.time, self.access, self.size, self.address)?;
-        if self.access == Access::Write {
-            write!(f, " = {:X}h", self.value)?;
+        write!(f, "{}: {}", self.time, self.words())?;
+        match self.count {
+            0 | 1 => Ok(()),
+            count => write!(f, " ({count} times)"),
         }
-        write!(f, ", pc {:08X}h: {}", self.pc, self.what)?;
-        if self.count > 1 {
-            write!(f, " ({} times)", self.count)?;
-        }
-        Ok(())
     }
 }
 

@@ -3,11 +3,11 @@
 
 use shared_abi::geometry::SYSTEM_MEMORY;
 use unicorn_engine::unicorn_const::{uc_error, HookType, MemType, Prot, TlbEntry};
-use unicorn_engine::{RegisterARM, Unicorn};
+use unicorn_engine::{RegisterARM, UcHookId, Unicorn};
 
 use super::blocks::count_instructions;
 use super::instruction::{self, Instruction};
-use super::{failed, masks, read, Cpu, Fault, State, NOWHERE, XPSR_IT};
+use super::{failed, masks, read, Cpu, Fault, Notes, State, NOWHERE, XPSR_IT};
 use crate::chip::memory_map::{
     counts_cycles, HIDDEN, OPTION_PAGE, OTP, PATCHED, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
     PRIVATE, SRAM_ALIAS, SYSTEM,
@@ -141,24 +141,13 @@ impl Cpu {
     /// time.
     pub(super) fn set_traps(&mut self) {
         let State { chip, notes } = self.uc.get_data_mut();
-        let traps = chip.scs.traps();
-        if traps == notes.traps {
-            return;
+        notes.traps = chip.scs.traps();
+        if notes.traps.any() != notes.trap_hook.is_some() {
+            self.switch(
+                |notes| &mut notes.trap_hook,
+                |uc| uc.add_code_hook(1, 0, |uc, address, _| on_instruction(uc, address as u32)),
+            );
         }
-        notes.traps = traps;
-        if traps.any() == notes.trap_hook.is_some() {
-            return;
-        }
-        match notes.trap_hook.take() {
-            Some(hook) => {
-                let _ = self.uc.remove_hook(hook);
-            }
-            None => {
-                let hook = self.uc.add_code_hook(1, 0, |uc, address, _| on_instruction(uc, address as u32));
-                self.uc.get_data_mut().notes.trap_hook = hook.ok();
-            }
-        }
-        let _ = self.uc.ctl_flush_tb();
     }
 
     /// Has every load from flash noticed while the data cache is in the way, and none otherwise: it costs time.
@@ -166,25 +155,36 @@ impl Cpu {
     pub(super) fn watch_loads(&mut self) {
         let State { chip, notes } = self.uc.get_data_mut();
         let flash = chip.geometry.flash;
-        if chip.flash.caches_data() == notes.load_hook.is_some() {
-            return;
-        }
-        match notes.load_hook.take() {
-            Some(hook) => {
-                let _ = self.uc.remove_hook(hook);
-            }
-            None => {
-                let (first, last) = (u64::from(flash.base), u64::from(flash.end() - 1));
-                let hook =
-                    self.uc.add_mem_hook(HookType::MEM_READ, first, last, |uc, _, address, size, _| {
+        let (first, last) = (u64::from(flash.base), u64::from(flash.end() - 1));
+        if chip.flash.caches_data() != notes.load_hook.is_some() {
+            self.switch(
+                |notes| &mut notes.load_hook,
+                |uc| {
+                    uc.add_mem_hook(HookType::MEM_READ, first, last, |uc, _, address, size, _| {
                         uc.get_data_mut().chip.load_flash(address as u32, size as u32);
                         forget_it_state(uc);
                         true
-                    });
-                self.uc.get_data_mut().notes.load_hook = hook.ok();
-            }
+                    })
+                },
+            );
         }
-        // Loads that are translated already do not look for hooks.
+    }
+
+    /// Removes a hook, or adds it.
+    fn switch(
+        &mut self,
+        hook: fn(&mut Notes) -> &mut Option<UcHookId>,
+        add: impl FnOnce(&mut Unicorn<'static, State>) -> Result<UcHookId, uc_error>,
+    ) {
+        let added = match hook(&mut self.uc.get_data_mut().notes).take() {
+            Some(old) => {
+                let _ = self.uc.remove_hook(old);
+                None
+            }
+            None => add(&mut self.uc).ok(),
+        };
+        *hook(&mut self.uc.get_data_mut().notes) = added;
+        // Code that is translated already does not look for hooks.
         let _ = self.uc.ctl_flush_tb();
     }
 }

@@ -686,7 +686,7 @@ impl Bench {
             let (name, board) = (self.name(n), &mut self.boards[n]);
             let reports = self.world.machine(board.id).reports();
             let new = reports.get(board.shown..).unwrap_or_default();
-            lines.extend(new.iter().map(|report| (report.time, format!("{name}: {}", unmodelled(report)))));
+            lines.extend(new.iter().map(|report| (report.time, format!("{name}: {}", report.words()))));
             board.shown = reports.len();
             let now = self.world.now();
             lines.extend(
@@ -747,16 +747,4 @@ fn happened(stop: Stop, cause: impl Fn() -> String) -> Option<String> {
             format!("the CPU has locked up by {}: only a reset helps it", cause())
         }
     })
-}
-
-/// A report in words, without its time and its count.
-fn unmodelled(report: &emulator::machine::Report) -> String {
-    let value = match report.access {
-        emulator::machine::Access::Write => format!(" = {:X}h", report.value),
-        _ => String::new(),
-    };
-    format!(
-        "{} of {} bytes at {:08X}h{value}, pc {:08X}h: {}",
-        report.access, report.size, report.address, report.pc, report.what
-    )
 }
