@@ -132,7 +132,7 @@ struct Running<D> {
     device: D,
     slave: Slave,
     /// The node-ID that was reported last.
-    told: Option<NodeId>,
+    reported: Option<NodeId>,
     /// The reset that ends the bootloader.
     pending_reset: Option<PendingReset>,
     /// A request to the program that the bootloader must answer.
@@ -197,7 +197,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         &mut self,
         now: Instant,
         send: &mut impl FnMut(Frame),
-        tell: &mut impl FnMut(Event),
+        report: &mut impl FnMut(Event),
     ) -> io::Result<bool> {
         let reset;
         let mut more = false;
@@ -217,7 +217,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 }
                 let finishing = running.device.is_finishing();
                 reset = running.exchange(now, !finishing, send);
-                running.tell_node_id(tell);
+                running.report_node_id(report);
             }
             Phase::StandIn(running, _, hosted) => {
                 let flash = running.device.flash();
@@ -229,15 +229,15 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     Some(hosted) => {
                         cause = ResetCause::Software;
                         hosted.leaving = hosted.leaving.or_else(|| running.leave_or_exchange(now, send));
-                        let ending = hosted.process.look(hosted.leaving.is_some());
+                        let ending = hosted.process.poll(hosted.leaving.is_some());
                         if let Some(ending) = ending {
-                            tell(Event::Ended { number: hosted.number, ending });
+                            report(Event::Ended { number: hosted.number, ending });
                         }
                         // A process that ends by itself leaves no request: a crash.
                         ending.map(|_| hosted.leaving)
                     }
                 };
-                running.tell_node_id(tell);
+                running.report_node_id(report);
             }
             Phase::Silent(_) | Phase::None => return Ok(false),
         }
@@ -251,7 +251,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 Phase::Silent(idle) => idle,
                 Phase::None => return Ok(false),
             };
-            tell(self.reset(idle, cause, request));
+            report(self.reset(idle, cause, request));
             more = true;
         }
         Ok(more)
@@ -305,7 +305,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 self.phase = match stand_in {
                     None => Phase::Silent(Idle { flash, buffer }),
                     Some(entries) => {
-                        let says = boot_core::canopen::device::Device { serial_number, ..config.device };
+                        let identity = boot_core::canopen::device::Device { serial_number, ..config.device };
                         let defaults = Defaults {
                             node_id: node.id.map(NodeId::get),
                             bit_rate: node.bit_rate.or_zero(),
@@ -325,7 +325,8 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                             let process = Process::start(command, &file, &program, place);
                             Hosted { number, process, leaving: None }
                         });
-                        let device = StandIn::new(entries, says, &start, hands_over, flash, config.layout);
+                        let device =
+                            StandIn::new(entries, identity, &start, hands_over, flash, config.layout);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
                         Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer, hosted)
@@ -367,8 +368,8 @@ fn slave(
 }
 
 impl<D: SlaveDevice> Running<D> {
-    fn new(device: D, slave: Slave, told: Option<NodeId>) -> Self {
-        Self { device, slave, told, pending_reset: None, owed: None }
+    fn new(device: D, slave: Slave, reported: Option<NodeId>) -> Self {
+        Self { device, slave, reported, pending_reset: None, owed: None }
     }
 
     fn handle(&mut self, frame: &Frame, now: Instant) {
@@ -382,11 +383,11 @@ impl<D: SlaveDevice> Running<D> {
     }
 
     /// Reports a node-ID that was set over the bus.
-    fn tell_node_id(&mut self, tell: &mut impl FnMut(Event)) {
+    fn report_node_id(&mut self, report: &mut impl FnMut(Event)) {
         let id = self.slave.node().map(Node::id);
-        if let Some(id) = id.filter(|_| id != self.told) {
-            self.told = Some(id);
-            tell(Event::NodeId(id));
+        if let Some(id) = id.filter(|_| id != self.reported) {
+            self.reported = Some(id);
+            report(Event::NodeId(id));
         }
     }
 

@@ -138,7 +138,7 @@ impl Process {
     }
 
     /// Looks after the process: `leaving`, the device waits for its end. Gives the end.
-    pub fn look(&mut self, leaving: bool) -> Option<Ending> {
+    pub fn poll(&mut self, leaving: bool) -> Option<Ending> {
         let child = match &mut self.child {
             Ok(child) => child,
             Err((kind, code)) => return Some(Ending::NotStarted(*kind, *code)),
@@ -295,29 +295,5 @@ mod tests {
             assert_eq!(End::Terminated { until: start }.next(leaving, ended, start), Deed::Over);
             assert_eq!(End::Killed { until: start }.next(leaving, ended, start), Deed::Over);
         }
-    }
-
-    #[test]
-    fn a_command_is_a_file_that_may_be_executed() {
-        let why = |name: &str| Command::find(name).unwrap_err();
-        assert!(why("/no/such/file").starts_with("there is no such file: "));
-        assert!(why("no-such-program-anywhere").contains("in the folders of PATH"));
-        assert!(why("").contains("there is no such file"));
-        let folder = env::temp_dir();
-        assert!(why(folder.to_str().unwrap()).starts_with("it is not a file"));
-        // Arguments are no part of it: nothing splits the words.
-        assert!(why("/bin/sh -c true").starts_with("there is no such file"));
-        let own = env::current_exe().unwrap();
-        assert_eq!(Command::find(own.to_str().unwrap()), Ok(Command { file: own }));
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn a_file_without_the_right_is_refused() {
-        let file = env::temp_dir().join(format!("coboot-node-run-{}", process::id()));
-        fs::write(&file, b"#!/bin/sh\n").unwrap();
-        let found = Command::find(file.to_str().unwrap());
-        fs::remove_file(&file).unwrap();
-        assert!(found.unwrap_err().starts_with("it must not be executed"));
     }
 }

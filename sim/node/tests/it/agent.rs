@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use crate::bus::{Coflash, Folder, Nodes, VECTORS};
+use crate::bus::{self, Coflash, Folder, Nodes};
 use crate::machine;
 use coboot_can::Link;
 use coflash_agent::{run, Buses, Config, Ended, Options, Message, Times};
@@ -17,9 +17,7 @@ const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];
 
 /// A program with this byte in it, as a raw image.
 fn program(byte: u8) -> Vec<u8> {
-    let mut bytes = vec![byte; 40 * 1024];
-    bytes[..8].copy_from_slice(&VECTORS);
-    bytes
+    bus::program(byte, 40 * 1024)
 }
 
 fn file(byte: u8) -> File {
@@ -47,17 +45,27 @@ fn options() -> Options {
 
 fn serve(config: &Config, options: &Options) -> (Ended, String) {
     let said = Mutex::new(String::new());
-    let tell = |message: &Message| {
+    let show = |message: &Message| {
         *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);
     };
     let open = |url: &str| Link::open(url, None).map_err(|error| error.to_string());
     let buses = Buses::new(&open, options.cancelled.clone());
-    let ended = run(config, options, &buses, &tell).unwrap();
+    let ended = run(config, options, &buses, &show).unwrap();
     (ended, said.into_inner().unwrap())
 }
 
-fn crc(coflash: &Coflash<'_>, node: &str) -> String {
+fn crc(coflash: &Coflash, node: &str) -> String {
     coflash.json(&["read", "1F56/1", "-N", node])["hex"].as_str().unwrap().to_string()
+}
+
+/// Node 5 with these arguments, a server with an action for it, and the configuration for the two.
+fn assigned(test: &str, arguments: &[&str]) -> (Folder, Nodes, Server, Config) {
+    let folder = Folder::new(test);
+    let nodes = Nodes::start(&folder, &[&["--node", "5", "--stand-in"], arguments].concat());
+    let server = Server::start(&IDS);
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    (folder, nodes, server, config)
 }
 
 #[test]
@@ -156,11 +164,7 @@ fn goes_on(server: &Server, config: &Config, begun: impl FnOnce()) -> Action {
 /// The agent is ended in the middle of an update, when the device has no program.
 #[test]
 fn an_agent_that_was_ended_goes_on() {
-    let folder = Folder::new("agent-restart");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "typical", "--stand-in"]);
-    let server = Server::start(&IDS);
-    server.assign(IDS[0], Action::new(1, &file(0xA5)));
-    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    let (folder, _nodes, server, config) = assigned("agent-restart", &["--flash", "typical"]);
     goes_on(&server, &config, || {
         let begun = |state: &kit::hawkbit::State| {
             state.targets[IDS[0]].action.as_ref().is_some_and(|action| !action.progress.is_empty())
@@ -191,11 +195,7 @@ fn leave_begun(record: &std::path::Path, kept: bool) {
 /// before. A device that runs the program is not flashed again.
 #[test]
 fn a_device_that_has_kept_the_program_is_not_flashed_again() {
-    let folder = Folder::new("agent-kept");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let server = Server::start(&IDS);
-    server.assign(IDS[0], Action::new(1, &file(0xA5)));
-    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    let (folder, _nodes, server, config) = assigned("agent-kept", &["--flash", "instant"]);
     assert_eq!(serve(&config, &options()).0.updated, 1);
     let record = record(&folder);
     for (kept, byte, starts) in [(true, 0xA5, 0), (false, 0xA5, 1), (true, 0x5A, 1)] {
@@ -213,13 +213,8 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
 /// The same for a product with CRC-16 and a file that has none: the device tells the CRC of its own.
 #[test]
 fn a_program_that_was_kept_is_known_by_a_crc_16_too() {
-    let folder = Folder::new("agent-kept-crc-16");
-    let product = ["--profile", "esacademy", "--crc16"];
-    let arguments = [&["--node", "5", "--flash", "instant", "--stand-in"], &product[..]].concat();
-    let nodes = Nodes::start(&folder, &arguments);
-    let server = Server::start(&IDS);
-    server.assign(IDS[0], Action::new(1, &file(0xA5)));
-    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    let product = ["--flash", "instant", "--profile", "esacademy", "--crc16"];
+    let (folder, _nodes, server, config) = assigned("agent-kept-crc-16", &product);
     assert_eq!(serve(&config, &options()).0.updated, 1);
     let record = record(&folder);
     leave_begun(&record, true);
@@ -315,9 +310,9 @@ fn a_machine_is_updated_by_one_package_and_each_outcome_is_told() {
         assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
         let details = action.details("closed");
         assert!(details.contains("8 of 8 programs are in their devices"), "{details}");
-        for its in ["panel: {}: node 1", "drive: {}: node 11, 12, 13, 14", "valve: {}: node 21, 22, 23"] {
-            let line = its.replace("{}", what);
-            assert!(details.lines().any(|its| its == line), "{line}: {details}");
+        for program in ["panel: {}: node 1", "drive: {}: node 11, 12, 13, 14", "valve: {}: node 21, 22, 23"] {
+            let line = program.replace("{}", what);
+            assert!(details.lines().any(|shown| shown == line), "{line}: {details}");
         }
         let plan = action.details("proceeding");
         assert!(number == 2 || plan.contains("node 77: not in the package, and left alone"), "{plan}");
@@ -344,25 +339,9 @@ fn a_machine_is_updated_by_one_package_and_each_outcome_is_told() {
     ] {
         assert!(details.contains(words), "{words}: {details}");
     }
-}
-
-/// The agent is ended in the middle of the drives. Another one goes on: the panel is not written again.
-#[test]
-fn the_update_of_a_machine_goes_on_after_a_restart() {
-    let server = Server::start(&IDS);
-    let start = |folder: &Folder| Nodes::start(folder, machine::PANEL);
-    let (folder, panel, config, file) = of_machine("agent-machine-restart", &server, &start);
-    let drives = Nodes::join(&folder, panel.url(), &machine::slow_drives("11"));
-    let valves = Nodes::join(&folder, panel.url(), &machine::valves("21", "3"));
-    drives.await_line("serial 14, node 14: bootloader");
-    valves.await_line("serial 23, node 23: bootloader");
-    server.assign(IDS[0], Action::new(1, &file));
-    // The first bytes after the vectors, so that each drive has half a program.
-    let action = goes_on(&server, &config, || folder.await_bytes("11.flash", 0x2_0000));
-    let details = action.details("closed");
-    for line in ["panel: had it before: node 1", "drive: updated: node 11, 12, 13, 14"] {
-        assert!(details.lines().any(|its| its == line), "{line}: {details}");
-    }
+    // Nothing is written by this action: its plan is told nevertheless.
+    let plan = action.details("proceeding");
+    assert!(plan.contains("node 77: not in the package, and left alone"), "{plan}");
 }
 
 /// Checks the result of the first target's action, and that its details have these lines, or lines with these
@@ -373,10 +352,10 @@ fn assert_ended(server: &Server, result: &str, lines: &[&str], errors: &[(&str, 
     let details = action.details("closed");
     assert_eq!(action.result.as_deref(), Some(result), "{details}");
     for line in lines {
-        assert!(details.lines().any(|its| its == *line), "{line}: {details}");
+        assert!(details.lines().any(|shown| shown == *line), "{line}: {details}");
     }
     for (whom, number) in errors {
-        let is_it = |its: &str| its.starts_with(&format!("{whom}: ")) && its.contains(number);
+        let is_it = |line: &str| line.starts_with(&format!("{whom}: ")) && line.contains(number);
         assert!(details.lines().any(is_it), "{whom}, {number}: {details}");
     }
     assert_eq!(details.matches("what to do: ").count(), errors.len(), "{details}");
@@ -389,66 +368,6 @@ fn panel_and_drives(folder: &Folder, url: &str) -> (Nodes, Nodes) {
     drives.await_line("serial 14, node 14: bootloader");
     panel.await_line("serial 1, node 1: bootloader");
     (panel, drives)
-}
-
-/// The drives lose their plug in mid-update: the others get their programs, and the next action goes on with the
-/// drives alone. In between a valve has got another program, and then another device has come in place of the panel;
-/// a node that the package does not name is left alone all the time.
-#[test]
-fn a_pulled_plug_another_program_and_another_device_are_told_and_the_others_go_on() {
-    let server = Server::start(&IDS);
-    let start = |folder: &Folder| Nodes::start(folder, &machine::valves("21", "3"));
-    let (folder, valves, config, file) = of_machine("agent-machine-plug", &server, &start);
-    let url = valves.url();
-    let (panel, drives) = panel_and_drives(&folder, url);
-    let stranger = Nodes::join(&folder, url, machine::STRANGER);
-    stranger.await_line("serial 77, node 77: bootloader");
-    server.assign(IDS[0], Action::new(1, &file));
-    while_it_runs(&config, || {
-        // The first bytes after the vectors, so that each drive has half a program.
-        folder.await_bytes("11.flash", 0x2_0000);
-        drop(drives);
-        await_result(&server);
-    });
-    let gone = ["node 11: drive", "node 12: drive", "node 13: drive", "node 14: drive"]
-        .map(|whom| (whom, "[0x60000013]"));
-    let others =
-        ["4 of 8 programs are in their devices", "panel: updated: node 1", "valve: updated: node 21, 22, 23"];
-    assert_ended(&server, "failure", &others, &gone);
-
-    let older = ["flash", "older.bin", "-I", "binary", "--board", "stm32f407g-disc1", "--node", "22"];
-    Coflash::new(&folder, &valves).done(&older);
-    let drives = Nodes::join(&folder, url, &machine::drives("11"));
-    drives.await_line("serial 14, node 14: bootloader");
-    server.assign(IDS[0], Action::new(2, &file));
-    serve(&config, &options());
-    let all = [
-        "8 of 8 programs are in their devices",
-        "panel: had it before: node 1",
-        "drive: updated: node 11, 12, 13, 14",
-        "valve: updated: node 22",
-        "valve: had it before: node 21, 23",
-    ];
-    assert_ended(&server, "success", &all, &[]);
-
-    drop(panel);
-    let other = ["--node", "1", "--serial", "101", "--vendor-id", "0x3F", "--product-code", "4"];
-    let other = Nodes::join(&folder, url, &other);
-    other.await_line("serial 101, node 1: bootloader");
-    server.assign(IDS[0], Action::new(3, &file));
-    serve(&config, &options());
-    let rest = [
-        "7 of 8 programs are in their devices",
-        "drive: had it before: node 11, 12, 13, 14",
-        "valve: had it before: node 21, 22, 23",
-    ];
-    assert_ended(&server, "failure", &rest, &[("node 1: panel", "[0x6000040B]")]);
-    // Nothing is written by this action: its plan is told nevertheless.
-    let plan = server.action(IDS[0]).details("proceeding").to_string();
-    assert!(plan.contains("node 77: not in the package, and left alone"), "{plan}");
-    for serial in ["77", "101"] {
-        assert!(folder.read(&format!("{serial}.flash")).iter().all(|byte| *byte == 0xFF), "{serial}");
-    }
 }
 
 /// The adapter loses its plug in mid-update, and comes back: each device's outcome is told, and the next action goes

@@ -22,6 +22,13 @@ pub const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", 
 /// inside, Thumb bit set.
 pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x02, 0x08];
 
+/// A program: its vectors, and then this byte.
+pub fn program(byte: u8, len: usize) -> Vec<u8> {
+    let mut bytes = vec![byte; len];
+    bytes[..8].copy_from_slice(&VECTORS);
+    bytes
+}
+
 /// A folder for one test, deleted at the end.
 pub struct Folder(kit::folder::Folder);
 
@@ -192,28 +199,35 @@ impl Nodes {
 }
 
 /// The host tool in the folder of a test, with a bus.
-pub struct Coflash<'a> {
-    folder: &'a Folder,
-    url: &'a str,
+pub struct Coflash {
+    folder: PathBuf,
+    url: String,
 }
 
-impl<'a> Coflash<'a> {
-    pub fn new(folder: &'a Folder, nodes: &'a Nodes) -> Self {
-        Self { folder, url: nodes.url() }
+/// Nodes in a folder, and the host tool on their bus.
+pub fn start(folder: Folder, arguments: &[&str]) -> (Folder, Nodes, Coflash) {
+    let nodes = Nodes::start(&folder, arguments);
+    let coflash = Coflash::new(&folder, &nodes);
+    (folder, nodes, coflash)
+}
+
+impl Coflash {
+    pub fn new(folder: &Folder, nodes: &Nodes) -> Self {
+        Self { folder: folder.path(""), url: nodes.url().to_owned() }
     }
 
     pub fn spawn(&self, arguments: &[&str]) -> Running {
-        self.spawn_at(arguments, &self.folder.0)
+        self.spawn_at(arguments, &self.folder)
     }
 
     /// The same with its locks in another folder, as on another computer.
     pub fn spawn_at(&self, arguments: &[&str], locks: &Path) -> Running {
-        let nowhere = self.folder.path("nowhere");
+        let nowhere = self.folder.join("nowhere");
         Running::start(
-            Command::new(program())
+            Command::new(host_tool())
                 .args(arguments)
-                .current_dir(&self.folder.0)
-                .env("COFLASH_BUS", self.url)
+                .current_dir(&self.folder)
+                .env("COFLASH_BUS", &self.url)
                 .env("XDG_CONFIG_HOME", &nowhere)
                 .env("XDG_STATE_HOME", &nowhere)
                 .env("XDG_RUNTIME_DIR", locks)
@@ -255,7 +269,7 @@ pub fn station(folder: &Folder, arguments: &[&str]) -> Done {
 }
 
 /// `COBOOT_COFLASH`, or the program built beside the nodes.
-fn program() -> OsString {
+fn host_tool() -> OsString {
     env::var_os("COBOOT_COFLASH").unwrap_or_else(|| beside("coflash").into_os_string())
 }
 

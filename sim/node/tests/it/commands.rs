@@ -11,35 +11,30 @@ use boot_core::store::{Journal, Parameters as _};
 use coboot_node::file_flash::{FileFlash, Speed};
 use shared_abi::layout::DEFAULT;
 
-use crate::bus::{Coflash, Folder, Nodes};
+use crate::bus::{self, Coflash, Folder, Nodes, FLASH};
 use serde_json::{json, Value};
 
-/// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
-/// inside, Thumb bit set.
-fn program(first: u8) -> Vec<u8> {
-    let mut bytes = vec![first; 200 * 1024];
-    bytes[..8].copy_from_slice(&crate::bus::VECTORS);
-    bytes
+fn program(byte: u8) -> Vec<u8> {
+    bus::program(byte, 200 * 1024)
 }
 
-const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
-
 fn folder(test: &str) -> Folder {
-    let folder = Folder::new(test);
-    folder.write("program.bin", &program(0xA5));
-    folder
+    Folder::with_program(test, &program(0xA5))
+}
+
+/// Nodes with these arguments in such a folder, and the host tool on their bus.
+fn start(test: &str, arguments: &[&str]) -> (Folder, Nodes, Coflash) {
+    bus::start(folder(test), arguments)
 }
 
 /// Bytes of the program's region that are not erased.
-fn rest(folder: &Folder) -> usize {
+fn programmed(folder: &Folder) -> usize {
     folder.read("1.flash")[0x2_0000..].iter().filter(|byte| **byte != 0xFF).count()
 }
 
 #[test]
 fn the_steps_of_an_update_one_by_one() {
-    let folder = folder("steps");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("steps", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let on = |words: &[&str]| coflash.done(&[words, &["-N", "5"]].concat());
     // No program yet: the manual's "no valid program" (1F57h = 02h), with coflash's number.
     let refused = coflash.run(&["start", "-N", "5"]);
@@ -58,9 +53,9 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(on(&["release"]), "node 5: program 1 is released for autostart\n");
     assert!(on(&["start"]).contains("an application"));
     // The application is called back before the erase; then nothing is left of it.
-    assert!(rest(&folder) > 190 * 1024);
+    assert!(programmed(&folder) > 190 * 1024);
     assert!(on(&["erase"]).starts_with("node 5: program 1 is erased, in "));
-    assert_eq!(rest(&folder), 0, "erased, not only marked");
+    assert_eq!(programmed(&folder), 0, "erased, not only marked");
     let status = coflash.json(&["status", "-N", "5"]);
     assert_eq!((&status["crc"], &status["bootloader"]), (&json!(0), &json!(true)));
     let refused = coflash.run(&["release", "-N", "5"]);
@@ -90,13 +85,11 @@ fn a_node_whose_journal_is_nearly_full_starts_its_program() {
 /// The erase of a program on flash with realistic times.
 #[test]
 fn erasing_waits_for_the_flash() {
-    let folder = folder("erase");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--board", "stm32f407g-disc1-two"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) = start("erase", &["--node", "5", "--board", "stm32f407g-disc1-two"]);
     let two = ["-I", "binary", "--board", "stm32f407g-disc1-two", "-N", "5"];
     coflash.done(&[&["flash", "program.bin", "--no-start"][..], &two].concat());
     let erased = coflash.json(&["erase", "-N", "5"]);
-    assert_eq!(rest(&folder), 0);
+    assert_eq!(programmed(&folder), 0);
     // 200 KiB lie in sectors 5 and 6: two times a second, by the datasheet.
     assert!(erased["seconds"].as_f64().unwrap() >= 2.0, "{erased}");
 }
@@ -105,9 +98,7 @@ fn erasing_waits_for_the_flash() {
 /// write-only) in words.
 #[test]
 fn the_program_cannot_be_read_back() {
-    let folder = folder("read");
-    let nodes = Nodes::start(&folder, &["--node", "5"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) = start("read", &["--node", "5"]);
     let refused = coflash.run(&["read", "1F50/1", "-N", "5", "-o", "back.bin"]);
     assert_eq!(refused.exit, 6);
     assert!(refused.err.contains("node 5 refuses reading 1F50h/1: abort 06010001h"), "{}", refused.err);
@@ -116,9 +107,7 @@ fn the_program_cannot_be_read_back() {
 
 #[test]
 fn an_update_in_all_its_ways() {
-    let folder = folder("ways");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) = start("ways", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let board = ["--board", "stm32f407g-disc1"];
     let region = ["--start-address", "0x08020000", "--end-address", "0x0802FFFF"];
     let ways: [(&[&str], &[&str]); 6] = [
@@ -146,9 +135,8 @@ fn an_update_in_all_its_ways() {
 
 #[test]
 fn a_job_file_serves_its_devices_and_reports() {
-    let folder = folder("job");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) =
+        start("job", &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
     coflash.done(&["convert", "program.bin", "program.blk", "-I", "binary", "--board", "stm32f407g-disc1"]);
     folder.write(
         "job.toml",
@@ -178,10 +166,8 @@ fn a_job_file_serves_its_devices_and_reports() {
 
 #[test]
 fn scan_monitor_and_shell_hear_the_nodes() {
-    let folder = folder("hear");
-    let nodes =
-        Nodes::start(&folder, &["--node", "5", "--count", "2", "--heartbeat", "50", "--flash", "instant"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, _nodes, coflash) =
+        start("hear", &["--node", "5", "--count", "2", "--heartbeat", "50", "--flash", "instant"]);
     let scan = coflash.json(&["scan", "--listen-only", "--listen", "500"]);
     let found: Vec<&Value> = scan["nodes"].as_array().unwrap().iter().map(|node| &node["node"]).collect();
     assert_eq!(found, [5, 6]);
@@ -202,9 +188,7 @@ fn scan_monitor_and_shell_hear_the_nodes() {
 #[cfg(unix)]
 #[test]
 fn an_interrupted_update_is_started_again_at_once() {
-    let folder = folder("interrupt");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) = start("interrupt", &["--node", "5", "--stand-in"]);
     let update = [FLASH, &["-N", "5", "-v"]].concat();
     // At the beginning, while blocks are written and sectors erased, and near the end.
     for (version, until) in (1..).zip(["erase the old program", "10 %", "40 %", "90 %"]) {
@@ -223,9 +207,7 @@ fn an_interrupted_update_is_started_again_at_once() {
 
 #[test]
 fn no_bus_no_node_no_sense() {
-    let folder = folder("nobody");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, nodes, coflash) = start("nobody", &["--node", "5", "--flash", "instant"]);
     // Each command talks to its own node: an update notices other clients of its node.
     let quick =
         |number: usize| ["--sdo-timeout".to_string(), "50".into(), "-N".into(), (9 + number).to_string()];
@@ -254,78 +236,44 @@ fn no_bus_no_node_no_sense() {
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
 }
 
-/// Two hosts talk to one node: the second one notices before it changes anything, by the lock of
-/// the first or by its requests, and the first one completes.
+/// Two hosts talk to one node, with an update or with a package: the second one notices before it changes anything,
+/// by the lock of the first or by its requests, and the first one completes.
 #[test]
 fn a_second_host_on_the_same_node_leaves_it_alone() {
-    let folder = folder("two-hosts");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) = start("two-hosts", &["--node", "5", "--stand-in"]);
     let elsewhere = folder.path("elsewhere");
     std::fs::create_dir_all(&elsewhere).unwrap();
-    let update = [FLASH, &["-N", "5", "-v", "--command-timeout", "5000"]].concat();
-    for (round, locks) in [(1, None), (2, Some(&elsewhere))] {
-        folder.write("program.bin", &program(round));
+    let one = b"board = 'stm32f407g-disc1'\n[[program]]\nimage = 'program.bin'\nnodes = [5]\n";
+    folder.write("one.toml", one);
+    coflash.done(&["package", "one.toml"]);
+    let update = [FLASH, &["-N", "5", "-v", "--from-start", "--command-timeout", "5000"]].concat();
+    for (round, locks, how) in [
+        (1, folder.path(""), "another coflash on this computer, process "),
+        (2, elsewhere, "another tool is using node 5"),
+    ] {
+        let program = bus::program(round, 600 * 1024);
+        folder.write("program.bin", &program);
         let first = coflash.spawn(&update);
         first.await_text("10 %");
-        let second = match locks {
-            None => coflash.spawn(&update),
-            Some(locks) => coflash.spawn_at(&update, locks),
-        };
-        let done = second.wait();
-        assert_eq!(done.exit, 6, "{}{}", done.out, done.err);
-        let how = if locks.is_none() {
-            "another coflash on this computer, process "
-        } else {
-            "another tool is using"
-        };
-        assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
-        assert!(!done.out.contains("erase"), "{}", done.out);
+        for (second, word) in [(&update[..], "erase"), (&["flash", "one.cpk", "--yes"], "node 5")] {
+            let done = coflash.spawn_at(second, &locks).wait();
+            assert_eq!(done.exit, 6, "{second:?}: {}{}", done.out, done.err);
+            assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
+            assert!(!done.out.contains(word), "{}", done.out);
+        }
         let done = first.wait();
         assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
-        assert_eq!(folder.read("1.flash")[0x2_0000..0x5_2000], program(round));
+        assert!(folder.read("1.flash")[0x2_0000..][..program.len()] == program);
     }
     // A process that has ended holds no lock.
     coflash.done(&update);
-}
-
-/// Requests of another client on the same bus.
-#[test]
-fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
-    let folder = folder("two-clients");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
-    let (stop, stopped) = std::sync::mpsc::channel::<()>();
-    let (ready, is_ready) = std::sync::mpsc::channel();
-    let address = nodes.address().to_owned();
-    let asks = std::thread::spawn(move || {
-        let mut stream = TcpStream::connect(address).unwrap();
-        assert_eq!(crate::bus::message(&mut stream), "< hi >");
-        stream.write_all(b"< open can0 >").unwrap();
-        assert_eq!(crate::bus::message(&mut stream), "< ok >");
-        ready.send(()).unwrap();
-        // Reads 1008h.
-        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
-            stream.write_all(b"< send 605 8 40 8 10 0 0 0 0 0 >").unwrap();
-        }
-    });
-    is_ready.recv().unwrap();
-    let refused = coflash.run(&[FLASH, &["-N", "5"]].concat());
-    assert_eq!(refused.exit, 6, "{}", refused.err);
-    assert!(refused.err.contains("another tool is using node 5"), "{}", refused.err);
-    assert!(!refused.out.contains("erase"), "{}", refused.out);
-    drop(stop);
-    asks.join().unwrap();
-    coflash.done(&[FLASH, &["-N", "5"]].concat());
 }
 
 /// Another client fills the bus, also with frames that look like answers of other nodes, and with
 /// invalid ones.
 #[test]
 fn frames_of_others_are_passed_over() {
-    let folder = folder("noise");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("noise", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let (stop, stopped) = std::sync::mpsc::channel::<()>();
     let address = nodes.address().to_owned();
     let noise = std::thread::spawn(move || {

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
-use crate::bus::{node, Coflash, Folder, Nodes, FLASH, VECTORS};
+use crate::bus::{self, node, Coflash, Folder, Nodes, FLASH, VECTORS};
 
 /// Runs what follows the vector table of a program (512 bytes, with what is between).
 const RUNNER: &str = "#!/bin/sh\ntail -c +513 \"$1\" > \"$1.sh\"\nexec /bin/sh \"$1.sh\"\n";
@@ -35,8 +35,8 @@ fn folder(test: &str, script: &str) -> Folder {
     folder
 }
 
-fn start(folder: &Folder) -> Nodes {
-    Nodes::start(folder, &["--node", "7", "--flash", "instant", "--run", "./run.sh"])
+fn start(folder: Folder) -> (Folder, Nodes, Coflash) {
+    bus::start(folder, &["--node", "7", "--flash", "instant", "--run", "./run.sh"])
 }
 
 /// Waits until the condition holds; a program of the host has two minutes for it.
@@ -57,9 +57,7 @@ fn ran(folder: &Folder) -> String {
 
 #[test]
 fn the_downloaded_program_runs_and_is_ended_on_the_call_back() {
-    let folder = folder("hosted", OBEYS);
-    let nodes = start(&folder);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start(folder("hosted", OBEYS));
     coflash.done(&[FLASH, &["-N", "7", "--watch", "0"]].concat());
     // The trial, which ends with the call back (1F51h = 80h), and the start after the release.
     for line in [
@@ -101,9 +99,7 @@ fn the_downloaded_program_runs_and_is_ended_on_the_call_back() {
 /// and /4 = 3).
 #[test]
 fn a_program_that_dies_leads_into_the_bootloader() {
-    let folder = folder("hosted-dies", "say begun\nexit 3");
-    let nodes = start(&folder);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start(folder("hosted-dies", "say begun\nexit 3"));
     // On trial, the first death is enough: it is not released.
     let trial = coflash.run(&[FLASH, &["-N", "7"]].concat());
     assert_eq!(trial.exit, 7, "{}{}", trial.out, trial.err);
@@ -127,9 +123,8 @@ fn a_program_that_dies_leads_into_the_bootloader() {
 /// SIGTERM, and SIGKILL a second later, for the program and for what it has started.
 #[test]
 fn a_program_that_ignores_its_end_is_killed_with_all_that_it_started() {
-    let folder = folder("hosted-ignores", "trap '' TERM\nsleep 1000 &\necho $! > child\nsay begun\nwait");
-    let nodes = start(&folder);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) =
+        start(folder("hosted-ignores", "trap '' TERM\nsleep 1000 &\necho $! > child\nsay begun\nwait"));
     coflash.done(&[FLASH, &["-N", "7", "--watch", "0", "--no-trial"]].concat());
     wait_for("the start", || ran(&folder).ends_with("version 1: begun\n"));
     coflash.done(&["enter", "-N", "7"]);
@@ -159,8 +154,7 @@ fn a_command_that_is_none_is_refused_by_name() {
     }
     // A file that the system does not take as a program has no shell to read it.
     command(&folder, "run.sh", b"say hello >> ran\n");
-    let nodes = start(&folder);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start(folder);
     let done = coflash.run(&[FLASH, &["-N", "7"]].concat());
     assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
     // ENOEXEC.

@@ -4,7 +4,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::bus::{Coflash, Folder, Nodes, VECTORS};
+use crate::bus::{program, Coflash, Folder, Nodes};
 
 /// The recipe: the panel first, then the drives, then the valves.
 const RECIPE: &str = r#"
@@ -28,18 +28,10 @@ image = "valve.bin"
 nodes = [21, 22, 23]
 "#;
 
-/// The part of a program that a bootloader checks, with data that differ.
-fn program(fill: u8) -> Vec<u8> {
-    let mut bytes = vec![fill; 40 * 1024];
-    bytes[..8].copy_from_slice(&VECTORS);
-    bytes[8..512].fill(0);
-    bytes
-}
-
 pub fn folder(test: &str) -> Folder {
     let folder = Folder::new(test);
     for (name, fill) in [("panel.bin", 1), ("drive.bin", 2), ("valve.bin", 3), ("older.bin", 4)] {
-        folder.write(name, &program(fill));
+        folder.write(name, &program(fill, 40 * 1024));
     }
     folder.write("machine.toml", RECIPE.as_bytes());
     folder
@@ -205,36 +197,6 @@ fn a_bus_without_any_device_of_the_package_is_an_error() {
     let json = coflash.run(&["flash", "line.cpk", "--yes", "--json"]);
     let value: Value = serde_json::from_str(&json.out).unwrap();
     assert_eq!((json.exit, &value["error"]["exit"]), (5, &5.into()));
-}
-
-/// Another tool, on this computer or on another one, is updating a node: the scan of a package does not begin, and
-/// breaks nothing.
-#[test]
-fn a_package_does_not_break_the_update_of_another_tool() {
-    let folder = folder("machine-two-tools");
-    let nodes = Nodes::start(&folder, &["--node", "21", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
-    folder.write("one.toml", b"board = 'stm32f407g-disc1'\n[[program]]\nimage = 'valve.bin'\nnodes = [21]\n");
-    coflash.done(&["package", "one.toml"]);
-    let mut long = program(4);
-    long.resize(600 * 1024, 4);
-    folder.write("long.bin", &long);
-    let other = ["flash", "long.bin", "-I", "binary", "--board", "stm32f407g-disc1", "--node", "21"];
-    let elsewhere = folder.path("elsewhere");
-    std::fs::create_dir_all(&elsewhere).unwrap();
-    for (locks, how) in [
-        (folder.path(""), "another coflash on this computer, process "),
-        (elsewhere, "another tool is using node 21"),
-    ] {
-        let first = coflash.spawn(&[&other[..], &["-v", "--from-start"]].concat());
-        first.await_text("10 %");
-        let done = coflash.spawn_at(&["flash", "one.cpk", "--yes"], &locks).wait();
-        assert_eq!(done.exit, 6, "{}{}", done.out, done.err);
-        assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
-        assert!(!done.out.contains("node 21"), "{}", done.out);
-        let done = first.wait();
-        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
-    }
 }
 
 /// Once the tool is killed, once it gets Ctrl-C, and once a device loses its power, each in the middle of the

@@ -6,7 +6,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use crate::bus::{node, Coflash, Folder, Nodes, FLASH, VECTORS};
+use crate::bus::{self, node, Coflash, Folder, Nodes, FLASH, VECTORS};
 
 fn program() -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..300 * 1024_u32).map(|i| (i * 7 + (i >> 8) * 13) as u8).collect();
@@ -26,6 +26,11 @@ fn flashed() -> Vec<u8> {
 
 fn folder(test: &str) -> Folder {
     Folder::with_program(test, &program())
+}
+
+/// Nodes with these arguments in such a folder, and the host tool on their bus.
+fn start(test: &str, arguments: &[&str]) -> (Folder, Nodes, Coflash) {
+    bus::start(folder(test), arguments)
 }
 
 #[test]
@@ -75,9 +80,7 @@ fn conform_installs_into_a_node_with_crc_16() {
 
 #[test]
 fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
-    let folder = folder("stand-in");
-    let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("stand-in", &["--node", "7", "--flash", "instant", "--stand-in"]);
     let release = ["-N", "7", "--verify", "--vid", "0", "--pid", "0", "--ver", "0x00640A01"];
     // 2007h/10: program 1 starts by itself, as the node does when it is switched on.
     assert_eq!(coflash.json(&["read", "2007/10", "-N", "7"])["number"], 0x0001_0000);
@@ -143,9 +146,8 @@ fn a_node_with_crc_16_starts_its_programs() {
 
 #[test]
 fn many_nodes_take_their_programs_at_the_same_time() {
-    let folder = folder("many");
-    let nodes = Nodes::start(&folder, &["--node", "10", "--count", "5", "--stand-in", "--serial", "0x100"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) =
+        start("many", &["--node", "10", "--count", "5", "--stand-in", "--serial", "0x100"]);
     coflash.done(&[FLASH, &["-N", "10-14", "--at-once", "5"]].concat());
     for serial in 0x100..0x105 {
         assert!(folder.read(&format!("{serial}.flash"))[0x2_0000..] == flashed(), "{serial}");
@@ -158,9 +160,7 @@ fn many_nodes_take_their_programs_at_the_same_time() {
 
 #[test]
 fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
-    let folder = folder("cut");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("cut", &["--node", "5", "--stand-in"]);
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     // Replaces the old program, which is lost with the first block.
     let flashing = coflash.spawn(&[FLASH, &["-N", "5"]].concat());
@@ -281,9 +281,8 @@ fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
 /// A device of another product: nothing is lost, and the exit code is the manual's number.
 #[test]
 fn a_program_for_another_product_is_refused() {
-    let folder = folder("product");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--product-code", "99", "--flash", "instant"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) =
+        start("product", &["--node", "5", "--product-code", "99", "--flash", "instant"]);
     coflash.done(&[FLASH, &["-N", "5", "--no-start", "--vid", "0", "--pid", "99"]].concat());
     let before = folder.read("1.flash");
     let said = coflash.run(&[FLASH, &["-N", "5", "--vid", "0", "--pid", "98"]].concat());
@@ -296,9 +295,7 @@ fn a_program_for_another_product_is_refused() {
 /// A node has no identity unless it is given one, and takes any program: the first example of the page.
 #[test]
 fn a_node_without_identity_takes_a_program_with_one() {
-    let folder = folder("nobody");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, _nodes, coflash) = start("nobody", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let named = ["-N", "5", "--vid", "0x3F", "--pid", "0x4007D151"];
     coflash.done(&[FLASH, &named].concat());
     coflash.done(&[FLASH, &named, &["--check-target"]].concat());
@@ -328,10 +325,8 @@ fn another_product_among_the_devices_of_a_group_refuses_alone() {
 
 #[test]
 fn two_programs_have_their_places() {
-    let folder = folder("two");
-    let nodes =
-        Nodes::start(&folder, &["--board", "stm32f407g-disc1-two", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) =
+        start("two", &["--board", "stm32f407g-disc1-two", "--flash", "instant", "--stand-in"]);
     // Vectors of program 2: reset at 0808_0200h.
     let mut second = program();
     second.truncate(1000);
@@ -366,9 +361,7 @@ fn two_programs_have_their_places() {
 /// the bootloader answers STOP.
 #[test]
 fn a_fresh_program_is_called_back_all_the_same() {
-    let folder = folder("fresh");
-    let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, nodes, coflash) = start("fresh", &["--node", "7", "--flash", "instant", "--stand-in"]);
     coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw"]].concat());
     nodes.await_line("serial 1, node 7: would start program 1");
     assert!(coflash.done(&["enter", "-N", "7"]).contains("the bootloader is running"));

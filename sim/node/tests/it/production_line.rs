@@ -5,11 +5,9 @@ use coflash_core::file::{ihex, read, Firmware, Format};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
-/// The part of a program that a bootloader checks, as Intel HEX.
+/// A program as Intel HEX.
 fn program() -> String {
-    let mut bytes = vec![0xA5; 20 * 1024];
-    // Initial stack pointer in RAM, reset vector inside, Thumb bit set.
-    bytes[..8].copy_from_slice(&bus::VECTORS);
+    let bytes = bus::program(0xA5, 20 * 1024);
     let Ok(Firmware::Image(image)) = read(&bytes, Some(Format::Raw), Some(LAYOUT.programs[0].base)) else {
         panic!("a raw image");
     };

@@ -4,17 +4,16 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::bus::{Coflash, Folder, Nodes, FLASH, VECTORS};
+use crate::bus::{self, Coflash, Folder, Nodes, FLASH};
 use serde_json::Value;
 
-fn program() -> Vec<u8> {
-    let mut bytes = vec![0xA5; 20 * 1024];
-    bytes[..8].copy_from_slice(&VECTORS);
-    bytes
+fn folder(test: &str) -> Folder {
+    Folder::with_program(test, &bus::program(0xA5, 20 * 1024))
 }
 
-fn folder(test: &str) -> Folder {
-    Folder::with_program(test, &program())
+/// Nodes with these arguments in such a folder, and the host tool on their bus.
+fn start(test: &str, arguments: &[&str]) -> (Folder, Nodes, Coflash) {
+    bus::start(folder(test), arguments)
 }
 
 fn eds() -> String {
@@ -31,9 +30,8 @@ fn lines(out: &str) -> Vec<Value> {
 
 #[test]
 fn objects_are_read_in_lists_and_by_their_names() {
-    let folder = folder("objects");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--serial", "77", "--vendor-id", "0x3F"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, _nodes, coflash) =
+        start("objects", &["--node", "5", "--serial", "77", "--vendor-id", "0x3F"]);
     let said = coflash.done(&["read", "1000", "1018/1..4", "-N", "5"]);
     let said: Vec<&str> = said.lines().collect();
     assert_eq!(said.len(), 5, "{said:?}");
@@ -79,9 +77,7 @@ fn objects_are_read_in_lists_and_by_their_names() {
 
 #[test]
 fn a_value_is_written_if_its_type_has_room_for_it() {
-    let folder = folder("write");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("write", &["--node", "5", "--flash", "instant", "--stand-in"]);
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     // A written value takes effect: in program control of CiA 302-3, 1 starts and 80h calls back.
     let said = coflash.done(&["write", "1F51/1", "1", "--type", "u8", "-N", "5"]);
@@ -123,9 +119,7 @@ fn a_value_is_written_if_its_type_has_room_for_it() {
 
 #[test]
 fn network_management_tells_what_the_heartbeat_says() {
-    let folder = folder("nmt");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "2"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, _nodes, coflash) = start("nmt", &["--node", "5", "--count", "2"]);
     // A bootloader is pre-operational and stays in this state.
     let said = coflash.done(&["nmt", "stop", "-N", "5"]);
     assert_eq!(said, "node 5: command sent; node 5 has not carried out the command and is pre-operational\n");
@@ -144,9 +138,8 @@ fn network_management_tells_what_the_heartbeat_says() {
 
 #[test]
 fn events_are_one_object_a_line() {
-    let folder = folder("events");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "2", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, _nodes, coflash) =
+        start("events", &["--node", "5", "--count", "2", "--flash", "instant", "--stand-in"]);
     let said = coflash.done(&[FLASH, &["-N", "5", "--json-events"]].concat());
     let all = lines(&said);
     let kinds: Vec<&str> = all.iter().map(|line| line["event"].as_str().unwrap()).collect();
@@ -199,9 +192,7 @@ fn events_are_one_object_a_line() {
 /// The advice for a silent device comes from the bus, for one device and for several.
 #[test]
 fn a_silent_device_of_several_is_diagnosed_as_one_alone() {
-    let folder = folder("silent");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (_folder, _nodes, coflash) = start("silent", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let quick = ["--boot-timeout", "300", "--sdo-timeout", "100", "--json", "--no-start"];
     let alone = coflash.run(&[FLASH, &["-N", "9"], &quick].concat());
     let [alone] = lines(&alone.out).try_into().unwrap();
@@ -224,9 +215,7 @@ fn only(folder: &Path) -> PathBuf {
 
 #[test]
 fn a_report_has_what_service_needs_and_no_password() {
-    let folder = folder("report");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
+    let (folder, nodes, coflash) = start("report", &["--node", "5", "--flash", "instant", "--stand-in"]);
     let secret = ["--unlock", "sesame", "--dialect", "block"];
     coflash.done(&[FLASH, &["-N", "5", "--report-dir", "reports"], &secret].concat());
     let run = only(&folder.path("reports"));
