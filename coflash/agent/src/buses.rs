@@ -197,7 +197,10 @@ impl Buses<'_> {
             return Flashed::Interrupted;
         }
         match (self.open)(&target.bus) {
-            Ok(link) => machine::update(link, &target.bus, package, &self.cancelled, news),
+            Ok(link) => {
+                let ended = machine::update(link, &target.bus, package, &self.cancelled, news);
+                ended.unwrap_or_else(|ended| ended)
+            }
             Err(why) => Flashed::NotNow(why),
         }
     }

@@ -476,6 +476,7 @@ mod tests {
             (with("").replace("node = 5", "node = 128"), "node-IDs"),
             (with("").replace("bus = 'socketcan:can0'\n", ""), "device 'door': it has no bus"),
             (with("").replace("socketcan:can0", "nowhere"), "device 'door': "),
+            (with("").replace("socketcan:can0", "cia309://h/net"), "its network must be a number"),
             (with("").replace("token-env = 'DOOR'", ""), "token-file or token-env"),
             (with("").replace("'DOOR'", "'NONE'"), "NONE is not set"),
             (with("").replace("'DOOR'", "'BROKEN'"), "one word"),

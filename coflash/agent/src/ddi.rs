@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::pause;
 
-/// The most deployments' chunks and artifacts that are device_answered at.
+/// The most deployments' chunks and artifacts that are read.
 const PARTS_MOST: usize = 64;
 /// The longest id of an action, and the longest name of a file.
 const ID_MOST: usize = 64;

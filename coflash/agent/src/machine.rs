@@ -19,17 +19,10 @@ use super::progress::{failure, not_now, waits, Shown};
 
 /// Updates the devices of a bus that the package is for. An interrupted update goes on with another call:
 /// its plan leaves out what the devices have.
+///
+/// # Errors
+/// How it ended before any device was changed.
 pub(super) fn update(
-    link: Link,
-    url: &str,
-    package: &Package,
-    cancelled: &Arc<AtomicBool>,
-    news: &Sender<News>,
-) -> Flashed {
-    carry_out(link, url, package, cancelled, news).unwrap_or_else(|flashed| flashed)
-}
-
-fn carry_out(
     link: Link,
     url: &str,
     package: &Package,

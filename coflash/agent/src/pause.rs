@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-/// The longest text that is device_answered at, in bytes.
+/// The longest text that is read, in bytes.
 const LONGEST: usize = 64;
 const MINUTE: u32 = 60;
 const HOUR: u32 = 60 * MINUTE;

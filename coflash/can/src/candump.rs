@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
-use super::hex::{hex_bytes, hex_number};
+use super::digits::{decimal, hex_bytes, hex_number};
 
 /// A line of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -51,13 +51,10 @@ impl Line {
 
 fn parse_time(text: &str) -> Option<Duration> {
     let (seconds, fraction) = text.split_once('.')?;
-    let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
-    if !digits(seconds) || !digits(fraction) || fraction.len() > 9 {
-        return None;
-    }
-    let nanos = fraction.parse::<u32>().ok()? * 10u32.pow(9 - fraction.len() as u32);
+    let nanos: u32 = decimal(fraction).filter(|_| fraction.len() <= 9)?;
+    let nanos = nanos * 10u32.pow(9 - fraction.len() as u32);
     // A time after the year 9999 is invalid.
-    let seconds = seconds.parse::<u64>().ok().filter(|seconds| *seconds < 1 << 38)?;
+    let seconds = decimal(seconds).filter(|seconds: &u64| *seconds < 1 << 38)?;
     Some(Duration::new(seconds, nanos))
 }
 

@@ -80,6 +80,14 @@ pub struct Missing {
     pub advice: &'static str,
 }
 
+/// The names of what is there, for advice: `kind` in the plural, and the words for none.
+pub(super) fn those_there(kind: &str, none: &str, names: impl Iterator<Item = String>) -> String {
+    match names.map(|name| shown(name.as_bytes())).take(16).collect::<Vec<_>>().join(", ") {
+        names if names.is_empty() => none.to_string(),
+        names => format!("this computer has these {kind}: {names}"),
+    }
+}
+
 /// External text made safe to show: no control characters, and a limited length.
 pub(super) fn shown(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);

@@ -14,9 +14,6 @@ use canopen::{AbortCode, Address, NodeId};
 
 use super::adapter::AdapterError;
 
-/// The URLs of gateways, for messages and help texts.
-pub const URLS: &str = "cia309://HOST:PORT/NET";
-
 /// Access to the object dictionaries of devices.
 pub trait Gateway {
     /// Reads an object. Calls `progress` with the number of bytes that have arrived.

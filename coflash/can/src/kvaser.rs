@@ -10,6 +10,7 @@ use embedded_can::{Frame as _, Id};
 use vendor_can::canlib::{Canlib, Message};
 
 use super::adapter::{AdapterError, Obstacle, ABSENT};
+use super::digits::decimal;
 use super::driven::{frame_of, Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
@@ -30,9 +31,7 @@ pub(super) fn check(channel: &str, rate: Option<u32>) -> Result<(), &'static str
 
 /// A channel by its number.
 fn number(channel: &str) -> Result<u16, &'static str> {
-    let digits = channel.bytes().all(|byte| byte.is_ascii_digit());
-    let number = channel.parse().ok().filter(|_| digits);
-    number.ok_or("it names no channel of CANlib by its number: kvaser:0@500k")
+    decimal(channel).ok_or("it names no channel of CANlib by its number: kvaser:0@500k")
 }
 
 /// The arguments of `canSetBusParams` for each bit rate: one of the constants `canBITRATE_…`, or

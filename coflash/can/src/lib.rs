@@ -8,6 +8,7 @@ mod beacons;
 pub mod candump;
 pub mod cia309;
 pub mod decode;
+mod digits;
 #[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
 mod driven;
 mod drivers;
@@ -17,7 +18,6 @@ pub mod gateway;
 #[cfg(feature = "gs_usb")]
 mod gs_usb;
 pub mod health;
-mod hex;
 pub mod hub;
 mod in_time;
 #[cfg(feature = "kvaser")]

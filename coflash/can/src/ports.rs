@@ -3,7 +3,7 @@
 use serialport::{ErrorKind, SerialPortInfo, SerialPortType};
 
 use super::adapter::{AdapterError, Obstacle};
-use super::found::{shown, Found, Kind, Missing};
+use super::found::{self, shown, Found, Kind, Missing};
 
 /// USB vendor and product IDs of adapters that speak only SLCAN (CANable: current and first IDs).
 const SLCAN: [(u16, u16); 2] = [(0x16D0, 0x117E), (0xAD50, 0x60C4)];
@@ -33,17 +33,9 @@ fn found(port: &SerialPortInfo) -> Found {
 
 /// A list of the serial ports, for advice.
 pub(super) fn those_there() -> String {
-    let ports: Vec<String> = serialport::available_ports()
-        .unwrap_or_default()
-        .iter()
-        .map(|port| shown(port.port_name.as_bytes()))
-        .filter(|name| !name.starts_with("/dev/tty."))
-        .take(16)
-        .collect();
-    match ports.as_slice() {
-        [] => "this computer has no serial port at present".to_string(),
-        ports => format!("this computer has these serial ports: {}", ports.join(", ")),
-    }
+    let ports = serialport::available_ports().unwrap_or_default();
+    let names = ports.into_iter().map(|port| port.port_name).filter(|name| !name.starts_with("/dev/tty."));
+    found::those_there("serial ports", "this computer has no serial port at present", names)
 }
 
 /// The error for a port that did not open, with advice.

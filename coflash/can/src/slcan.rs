@@ -10,9 +10,9 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use shared_abi::bxcan::data_length;
 
 use super::adapter::{Adapter, AdapterError};
+use super::digits::{hex_bytes, hex_number};
 use super::echo::Echoes;
 use super::health::{Controller, Health};
-use super::hex::{hex_bytes, hex_number};
 use super::ports;
 use super::tcp::{connect, waits, PATIENCE};
 

@@ -12,7 +12,7 @@ use embedded_can::Frame as _;
 use socketcan::{CanFrame, CanSocket, Socket, SocketOptions};
 
 use super::adapter::{Adapter, AdapterError, Obstacle};
-use super::found::shown;
+use super::found;
 use super::health::{Controller, Health};
 use super::links;
 use super::tcp::waits;
@@ -125,15 +125,12 @@ fn switch_on(interface: &str) -> String {
 
 /// A list of the CAN interfaces, for advice.
 fn those_there() -> String {
+    const NONE: &str =
+        "this computer has no CAN interface at present: plug the adapter in; its driver creates one (ip link shows it); \
+         then switch that on: sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter works without an interface: \
+         slcan:/dev/ttyACM0@500k";
     let links = links::all().unwrap_or_default();
-    let names: Vec<String> = links.iter().map(|link| shown(link.name.as_bytes())).take(16).collect();
-    match names.as_slice() {
-        [] => "this computer has no CAN interface at present: plug the adapter in; its driver creates one (ip link shows it); \
-               then switch that on: sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter works without an interface: \
-               slcan:/dev/ttyACM0@500k"
-            .to_string(),
-        names => format!("this computer has these CAN interfaces: {}", names.join(", ")),
-    }
+    found::those_there("CAN interfaces", NONE, links.into_iter().map(|link| link.name))
 }
 
 impl Adapter for SocketCan {

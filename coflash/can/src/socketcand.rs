@@ -10,10 +10,10 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
+use super::digits::{hex_bytes, hex_number};
 use super::echo::Echoes;
 use super::found::shown;
 use super::health::Health;
-use super::hex::{hex_bytes, hex_number};
 use super::tcp::{connect, waits, PATIENCE};
 
 /// Longer than any message of the protocol.
@@ -613,22 +613,6 @@ mod tests {
         drop(listener);
         let error = Socketcand::connect(&address, "can0").unwrap_err();
         assert!(matches!(error, AdapterError::Open { .. }), "{error}");
-    }
-
-    #[test]
-    fn a_url_that_names_no_adapter_is_explained() {
-        for (url, words) in [
-            ("", "has no ':'"),
-            ("can0", "has no ':'"),
-            ("pcan:1", "there is no such adapter"),
-            ("socketcand:localhost/can0", "must be socketcand://HOST:PORT/BUS"),
-            ("socketcand://localhost", "names no bus"),
-            ("socketcand:///can0", "must be socketcand://HOST:PORT/BUS"),
-            ("socketcand://localhost/can0 >", "must be socketcand://HOST:PORT/BUS"),
-        ] {
-            let error = crate::open(url).map(|_| ()).unwrap_err();
-            assert!(error.to_string().contains(words), "{error}");
-        }
     }
 
     proptest! {

@@ -1,6 +1,7 @@
 //! The URL of an adapter, checked before anything is opened.
 
 use super::adapter::{NO_ADAPTER, NO_SCHEME};
+use super::digits::decimal;
 use super::drivers::driver;
 use super::found::Kind;
 
@@ -71,11 +72,11 @@ impl Target {
                 const FORM: &str = "it must be cia309://HOST:PORT/NET";
                 let rest = rest.strip_prefix("//").ok_or(FORM)?;
                 let (server, network) = rest.split_once('/').unwrap_or((rest, "1"));
-                let digits = network.bytes().all(|digit| digit.is_ascii_digit());
-                let network = network.parse().ok().filter(|_| digits);
-                let network = network.ok_or("its network must be a number from 0 to 65535");
-                let server = word(server).then(|| server.to_string()).ok_or(FORM)?;
-                Ok(Self::Gateway { server, network: network? })
+                if !word(server) {
+                    return Err(FORM.to_string());
+                }
+                let network = decimal(network).ok_or("its network must be a number from 0 to 65535")?;
+                Ok(Self::Gateway { server: server.to_string(), network })
             }
             // A Windows drive is not a port, but users often write COM7: for a port.
             scheme if is_port(scheme) => Err(no_scheme(url.trim_end_matches(':'))),
@@ -127,7 +128,7 @@ fn with_driver(kind: Kind, rest: &str) -> Result<Target, String> {
 /// The text before the last `@`, and the bit rate after it.
 fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
     let Some((before, rate)) = text.rsplit_once('@') else { return Ok((text, None)) };
-    let bare = rate.bytes().all(|byte| byte.is_ascii_digit()).then(|| rate.parse::<u32>().ok()).flatten();
+    let bare = decimal::<u32>(rate);
     match (bare, parse_bit_rate(rate)) {
         // No CAN bus runs at 500 bit/s.
         (Some(1), _) => Err("1 bit/s is not a bit rate of CAN; did you mean 1M?".to_string()),
@@ -172,15 +173,12 @@ fn parse_bit_rate(text: &str) -> Option<u32> {
             None => (text, 1),
         },
     };
-    let digits = Some(digits).filter(|digits| digits.bytes().all(|byte| byte.is_ascii_digit()))?;
-    digits.parse::<u32>().ok()?.checked_mul(unit).filter(|rate| (1..=1_000_000).contains(rate))
+    decimal::<u32>(digits)?.checked_mul(unit).filter(|rate| (1..=1_000_000).contains(rate))
 }
 
 fn is_port(text: &str) -> bool {
     let lower = text.to_ascii_lowercase();
-    let com = lower
-        .strip_prefix("com")
-        .is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()));
+    let com = lower.strip_prefix("com").and_then(decimal::<u32>).is_some();
     com || text.starts_with("/dev/")
 }
 
@@ -189,11 +187,8 @@ fn no_scheme(text: &str) -> String {
     let none = NO_SCHEME;
     let bare = text.split('@').next().unwrap_or_default();
     let lower = bare.to_ascii_lowercase();
-    let interface = ["can", "vcan", "slcan"].iter().any(|name| {
-        lower
-            .strip_prefix(name)
-            .is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
-    });
+    let names = ["can", "vcan", "slcan"];
+    let interface = names.iter().any(|name| lower.strip_prefix(name).and_then(decimal::<u32>).is_some());
     if is_port(bare) {
         let rate = if text.contains('@') { "" } else { "@500k" };
         format!("{none}; did you mean slcan:{text}{rate}?")
@@ -256,6 +251,13 @@ mod tests {
             ("pcan:PCAN_USBBUS1", "did you mean peak:PCAN_USBBUS1?"),
             ("SLCAN:COM7", "did you mean slcan:COM7?"),
             ("socketcand://host/can0@500k", "the server sets the bit rate"),
+            ("", "has no ':'"),
+            ("can0", "has no ':'"),
+            ("pcan:1", "there is no such adapter"),
+            ("socketcand:localhost/can0", "must be socketcand://HOST:PORT/BUS"),
+            ("socketcand://localhost", "names no bus"),
+            ("socketcand:///can0", "must be socketcand://HOST:PORT/BUS"),
+            ("socketcand://localhost/can0 >", "must be socketcand://HOST:PORT/BUS"),
             ("cia309:host/1", "must be cia309://HOST:PORT/NET"),
             ("cia309:///1", "must be cia309://HOST:PORT/NET"),
             ("cia309://host/net", "its network must be a number"),

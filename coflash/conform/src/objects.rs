@@ -9,19 +9,14 @@ use super::sdo::{text, INVALID, NO_DATA, NO_OBJECT, NO_SUB_INDEX, READ_ONLY};
 const IDENTITY: &str = "CiA 301 4.2, object 1018h";
 const ERRORS: &str = "CiA 301 4.2, object 1003h";
 
+/// An object that is read by expedited upload, with its number of bytes.
+const fn number(id: &'static str, title: &'static str, clause: &'static str, index: u16, len: u8) -> Check {
+    Check::of(id, title, clause, Run::Number(index, 0, len))
+}
+
 pub(super) const CHECKS: &[Check] = &[
-    Check::of(
-        "OD-001",
-        "device type, 1000h, is 4 bytes, expedited",
-        "CiA 301 4.2, object 1000h",
-        Run::Number(0x1000, 0, 4),
-    ),
-    Check::of(
-        "OD-002",
-        "error register, 1001h, is 1 byte, expedited",
-        "CiA 301 4.2, object 1001h",
-        Run::Number(0x1001, 0, 1),
-    ),
+    number("OD-001", "device type, 1000h, is 4 bytes, expedited", "CiA 301 4.2, object 1000h", 0x1000, 4),
+    number("OD-002", "error register, 1001h, is 1 byte, expedited", "CiA 301 4.2, object 1001h", 0x1001, 1),
     Check::new("OD-003", "1018h/0 is 1 to 4", IDENTITY, |b| match b.value(0x1018, 0, 1)? {
         1..=4 => Ok(()),
         other => failed(format!("1018h/0 is {other}")),
@@ -36,13 +31,8 @@ pub(super) const CHECKS: &[Check] = &[
         ensure!(first == second, "{first:08X}h, then {second:08X}h");
         Ok(())
     }),
-    Check::of(
-        "OD-007",
-        "producer heartbeat time, 1017h, is 2 bytes",
-        "CiA 301 4.2, object 1017h",
-        Run::Number(0x1017, 0, 2),
-    )
-    .needs(|b| has(b, 0x1017, 0)),
+    number("OD-007", "producer heartbeat time, 1017h, is 2 bytes", "CiA 301 4.2, object 1017h", 0x1017, 2)
+        .needs(|b| has(b, 0x1017, 0)),
     Check::new("OD-008", "device name, 1008h, is printable text", "CiA 301 4.2, object 1008h", |b| {
         printable(b, 0x1008)
     }),
@@ -63,7 +53,7 @@ pub(super) const CHECKS: &[Check] = &[
         },
     )
     .needs(|b| has(b, 0x1014, 0)),
-    Check::of("EMCY-002", "number of errors, 1003h/0, is 1 byte", ERRORS, Run::Number(0x1003, 0, 1))
+    number("EMCY-002", "number of errors, 1003h/0, is 1 byte", ERRORS, 0x1003, 1)
         .needs(|b| has(b, 0x1003, 0)),
     Check::of(
         "EMCY-003",

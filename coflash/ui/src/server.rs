@@ -159,11 +159,10 @@ impl Server {
             view,
         };
         let app = router(site, self.guard, files, routes);
-        let Options { write_timeout, head_timeout, .. } = self.options;
-        let (listener, times) = (self.listener, Times { write_timeout, head_timeout });
+        let (listener, options) = (self.listener, &self.options);
         let left = self.runtime.block_on(async {
             tokio::select! {
-                () = accept(listener, app, times) => {}
+                () = accept(listener, app, options) => {}
                 () = set(end) => {}
             }
             end_in_order(&shared).await
@@ -206,15 +205,9 @@ async fn set(flag: &AtomicBool) {
     }
 }
 
-/// The limits of time of a connection.
-#[derive(Clone, Copy)]
-struct Times {
-    write_timeout: Duration,
-    head_timeout: Duration,
-}
-
 /// Accepts connections without end. If there are too many, the oldest without the token gives way.
-async fn accept(listener: TcpListener, app: axum::Router, times: Times) {
+async fn accept(listener: TcpListener, app: axum::Router, options: &Options) {
+    let Options { write_timeout, head_timeout, .. } = *options;
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     let mut guests = Guests::default();
     loop {
@@ -231,18 +224,19 @@ async fn accept(listener: TcpListener, app: axum::Router, times: Times) {
         let (app, guest) = (app.clone(), Guest::default());
         let served = guest.clone();
         let task = tokio::spawn(async move {
-            serve(stream, app, served, times).await;
+            serve(stream, app, served, (write_timeout, head_timeout)).await;
             drop(place);
         });
         guests.add(guest, task.abort_handle());
     }
 }
 
-/// Serves one connection. An error of the connection is the browser's concern.
-async fn serve(stream: TcpStream, app: axum::Router, guest: Guest, times: Times) {
+/// Serves one connection, with the limits of time of a write and of a request's header. An error of the
+/// connection is the browser's concern.
+async fn serve(stream: TcpStream, app: axum::Router, guest: Guest, (write, head): (Duration, Duration)) {
     let _ = stream.set_nodelay(true);
     let mut stream = TimeoutStream::new(stream);
-    stream.set_write_timeout(Some(times.write_timeout));
+    stream.set_write_timeout(Some(write));
     let app = TowerToHyperService::new(app);
     let service = service_fn(move |mut request: Request<Incoming>| {
         request.extensions_mut().insert(guest.clone());
@@ -250,7 +244,7 @@ async fn serve(stream: TcpStream, app: axum::Router, guest: Guest, times: Times)
     });
     let _ = http1::Builder::new()
         .timer(TokioTimer::new())
-        .header_read_timeout(times.head_timeout)
+        .header_read_timeout(head)
         .max_buf_size(64 * 1024)
         .serve_connection(TokioIo::new(Box::pin(stream)), service)
         .await;

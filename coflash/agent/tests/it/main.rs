@@ -116,12 +116,23 @@ fn options() -> Options {
 
 /// Runs the agent until there is nothing to do; returns its end, and what it said.
 fn once(server: &Server, folder: &Folder, fake: &Fake, ids: &[&str]) -> (Ended, String) {
+    run_once(&config(server, folder, ids), fake)
+}
+
+fn run_once(config: &Config, fake: &Fake) -> (Ended, String) {
     let said = Mutex::new(String::new());
     let tell = |message: &Message| {
         *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);
     };
-    let ended = run(&config(server, folder, ids), &options(), fake, &tell).unwrap();
+    let ended = run(config, &options(), fake, &tell).unwrap();
     (ended, said.into_inner().unwrap())
+}
+
+/// Devices that are busy until this flag is cleared, and a server with an action for the first.
+fn busy() -> (Server, Fake, Arc<AtomicBool>) {
+    let (server, busy) = (Server::start(&[ID]), Arc::new(AtomicBool::new(true)));
+    server.assign(ID, Action::new(3, &file()));
+    (server, Fake { busy: Some(busy.clone()), ..Fake::default() }, busy)
 }
 
 #[test]
@@ -302,10 +313,7 @@ fn a_wrong_token_is_said_and_not_shown() {
         server.url
     );
     let config = Config::parse(&text, &folder, None, None).unwrap();
-    let said = Mutex::new(String::new());
-    let tell = |message: &Message| *said.lock().unwrap() += &message.text;
-    let ended = run(&config, &options(), &fake, &tell).unwrap();
-    let said = said.into_inner().unwrap();
+    let (ended, said) = run_once(&config, &fake);
     assert_eq!(ended.unserved, 1);
     assert!(said.contains("check the token") && !said.contains("wrong-secret"), "{said}");
 }
@@ -325,10 +333,7 @@ fn while_it_runs(server: &Server, folder: &Folder, fake: &Fake, act: impl FnOnce
 
 #[test]
 fn a_cancellation_during_the_update_is_rejected_with_a_reason() {
-    let (server, folder) = (Server::start(&[ID]), folder("cancel"));
-    let busy = Arc::new(AtomicBool::new(true));
-    let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
-    server.assign(ID, Action::new(3, &file()));
+    let (folder, (server, fake, busy)) = (folder("cancel"), busy());
     while_it_runs(&server, &folder, &fake, |_| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         server.state().targets.get_mut(ID).unwrap().action.as_mut().unwrap().cancelling = true;
@@ -378,10 +383,7 @@ fn what_was_interrupted_goes_on_after_a_restart() {
 
 #[test]
 fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
-    let (server, folder) = (Server::start(&[ID]), folder("late"));
-    let busy = Arc::new(AtomicBool::new(true));
-    let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
-    server.assign(ID, Action::new(3, &file()));
+    let (folder, (server, fake, busy)) = (folder("late"), busy());
     while_it_runs(&server, &folder, &fake, |_| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         server.fault("feedback", 1000, Fault::Status(500, None));
@@ -446,10 +448,7 @@ fn a_bus_that_stays_away_ends_what_is_done_once() {
 /// The update ends while the agent is being ended: its result must not get lost.
 #[test]
 fn a_result_that_comes_while_the_agent_ends_is_kept() {
-    let (server, folder) = (Server::start(&[ID]), folder("ending"));
-    let busy = Arc::new(AtomicBool::new(true));
-    let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
-    server.assign(ID, Action::new(3, &file()));
+    let (folder, (server, fake, busy)) = (folder("ending"), busy());
     while_it_runs(&server, &folder, &fake, |cancelled| {
         server.wait("progress", |state| action(state).progress.contains(&40));
         cancelled.store(true, Ordering::Relaxed);

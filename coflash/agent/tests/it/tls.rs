@@ -3,10 +3,10 @@
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::thread;
 
-use coflash_agent::{run, Config, Ended, Message};
+use coflash_agent::{Config, Ended};
 use kit::hawkbit::{Action, Fault, File, Server};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -78,10 +78,7 @@ fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
          token-file = 'token'\n"
     );
     let config = Config::parse(&text, &folder, None, None).unwrap();
-    let said = Mutex::new(String::new());
-    let tell = |message: &Message| *said.lock().unwrap() += &format!("{}\n", message.text);
-    let ended = run(&config, &crate::options(), &crate::Fake::default(), &tell).unwrap();
-    (ended, said.into_inner().unwrap())
+    crate::run_once(&config, &crate::Fake::default())
 }
 
 #[test]

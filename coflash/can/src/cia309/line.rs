@@ -2,6 +2,8 @@
 
 use canopen::NodeId;
 
+use crate::digits::decimal;
+
 /// The first word of an answer or an event that reports an error.
 pub(super) const ERROR: &str = "ERROR";
 /// The event code of a boot-up message.
@@ -25,10 +27,7 @@ pub(super) fn parse(text: &str) -> Option<Line> {
     let text = text.trim();
     if let Some(rest) = text.strip_prefix('[') {
         let (number, answer) = rest.split_once(']')?;
-        // `parse` would accept a sign.
-        let number = number.trim();
-        let number = number.parse().ok().filter(|_| number.bytes().all(|digit| digit.is_ascii_digit()))?;
-        return Some(Line::Answer(number, answer.trim().to_string()));
+        return Some(Line::Answer(decimal(number.trim())?, answer.trim().to_string()));
     }
     if let Some(error) = text.strip_prefix("...").filter(|rest| rest.starts_with(ERROR)) {
         return Some(Line::Broken(error.to_string()));

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use crate::digits::decimal;
+
 /// The device, and its channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Which {
@@ -25,16 +27,11 @@ impl Which {
             Some((device, channel)) => (device, Some(channel)),
             None => (text, None),
         };
-        let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
-        let channel = match channel {
-            Some(channel) if digits(channel) => channel.parse().ok()?,
-            Some(_) => return None,
-            None => 0,
-        };
-        let device = match device {
-            "" => return None,
-            place if digits(place) && place.len() <= 2 => Choice::Place(place.parse().ok()?),
-            serial => Choice::Serial(serial.to_string()),
+        let channel = channel.map_or(Some(0), decimal)?;
+        let device = match decimal(device) {
+            _ if device.is_empty() => return None,
+            Some(place) if device.len() <= 2 => Choice::Place(place),
+            _ => Choice::Serial(device.to_string()),
         };
         Some(Self { device, channel })
     }

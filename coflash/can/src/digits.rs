@@ -1,4 +1,11 @@
-//! Hexadecimal digits in the text protocols of adapters and in logs.
+//! Digits in URLs, in the text protocols of adapters and in logs.
+
+use std::str::FromStr;
+
+/// A number of decimal digits alone, without sign or blank.
+pub(crate) fn decimal<T: FromStr>(text: &str) -> Option<T> {
+    text.bytes().all(|byte| byte.is_ascii_digit()).then(|| text.parse().ok()).flatten()
+}
 
 /// A number of hexadecimal digits alone, without sign or blank.
 pub(crate) fn hex_number(text: &str) -> Option<u32> {
