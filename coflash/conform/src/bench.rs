@@ -88,7 +88,7 @@ pub(super) fn skipped<T>(why: impl Into<String>) -> Result<T, Stop> {
 macro_rules! ensure {
     ($holds:expr, $($words:tt)+) => {
         if !$holds {
-            return Err($crate::Stop::Failed(format!($($words)+)));
+            return Err($crate::bench::Stop::Failed(format!($($words)+)));
         }
     };
 }
@@ -97,7 +97,7 @@ macro_rules! ensure {
 macro_rules! need {
     ($holds:expr, $($words:tt)+) => {
         if !$holds {
-            return Err($crate::Stop::Skipped(format!($($words)+)));
+            return Err($crate::bench::Stop::Skipped(format!($($words)+)));
         }
     };
 }

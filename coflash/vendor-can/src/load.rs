@@ -84,7 +84,7 @@ macro_rules! library {
 
         impl $name {
             /// Finds the library and its functions.
-            fn find() -> Result<Self, $crate::LoadError> {
+            fn find() -> Result<Self, $crate::load::LoadError> {
                 // SAFETY: the files come from the vendor's installer; the types are those of its
                 // header, and the functions live as long as the library beside them.
                 unsafe {
