@@ -72,15 +72,6 @@ pub fn challenge(session: &mut Session<'_>) -> Result<Challenge, Error> {
     Ok(Challenge(bytes))
 }
 
-/// Reads the challenge of a device that may not have this object. `None` if the object is missing
-/// or its value is invalid.
-///
-/// # Errors
-/// The errors of [`challenge`], except a refusal.
-pub fn reported_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Error> {
-    reported(challenge(session))
-}
-
 /// What a device reports about the images that it takes. `Display` shows it in one line.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
@@ -102,7 +93,7 @@ pub struct Security {
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.
 pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
-    match reported_challenge(session)? {
+    match reported(challenge(session))? {
         Some(challenge) => security_of(session, &challenge).map(Some),
         None => Ok(None),
     }
@@ -113,7 +104,7 @@ pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
 /// # Errors
 /// [`Error::SealedOnly`], and the errors of a [read](Session::read).
 pub(crate) fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
-    match reported_challenge(session)? {
+    match reported(challenge(session))? {
         Some(challenge) if challenge.is_sealed() => {
             let roots = security_of(session, &challenge)?.roots;
             Err(Error::SealedOnly { node: session.node(), roots })

@@ -123,8 +123,8 @@ impl<'s, 'a> Debugger<'s, 'a> {
         let len = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         let mut rest = bytes;
         for (at, len) in chunks(address, len) {
-            let (piece, behind) = rest.split_at(usize::from(len));
-            rest = behind;
+            let (piece, after) = rest.split_at(usize::from(len));
+            rest = after;
             self.command(Kind::Write, at, len)?;
             self.session.write(DATA, piece, Doing::Write(DATA), &mut |done| progress(at - address + done))?;
         }

@@ -165,14 +165,14 @@ pub fn plan(
     let mut plan = matched(package, &found)?;
     // The CRC of a bootloader is not among the information about a device.
     for device in &mut plan.devices {
-        let Some(its) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
+        let Some(info) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
         for step in &mut device.steps {
             let Some((_, new)) = package.program(step.entry) else { continue };
-            let Some(bootloader) = its.bootloader.as_ref().filter(|_| new.is_bootloader()) else { continue };
+            let Some(bootloader) = info.bootloader.as_ref().filter(|_| new.is_bootloader()) else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
             match program_info(&mut session, bootloader.number) {
-                Ok(has) if step.todo == Todo::Update && has_bootloader(its, &has, new) => {
+                Ok(has) if step.todo == Todo::Update && has_bootloader(info, &has, new) => {
                     step.todo = Todo::Has;
                 }
                 Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error.into()),
@@ -207,11 +207,11 @@ pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Pla
             plan.devices.push(Device { node: *node, name, identity, steps });
         }
     }
-    for (entry, (its, _)) in package.programs().enumerate() {
+    for (entry, (row, _)) in package.programs().enumerate() {
         let mut miss = |node, fault| {
-            plan.missing.push(Missing { entry, program: its.name.clone(), node, fault });
+            plan.missing.push(Missing { entry, program: row.name.clone(), node, fault });
         };
-        for node in its.nodes.iter().filter_map(|node| NodeId::new(*node)) {
+        for node in row.nodes.iter().filter_map(|node| NodeId::new(*node)) {
             if !plan.devices.iter().any(|device| device.node == node) {
                 let but = found.get(&node).and_then(|found| found.but.clone());
                 let absent = DeviceFault::Absent { node };
@@ -220,9 +220,9 @@ pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Pla
         }
         let devices = plan.devices.iter().flat_map(|device| &device.steps);
         let count = devices.filter(|step| step.entry == entry).count();
-        match its.count.map(usize::from) {
+        match row.count.map(usize::from) {
             Some(expected) if count < expected => {
-                miss(None, DeviceFault::TooFew { program: its.name.clone(), expected, found: count });
+                miss(None, DeviceFault::TooFew { program: row.name.clone(), expected, found: count });
             }
             _ => {}
         }
@@ -288,10 +288,10 @@ fn differs(entry: &Entry, node: NodeId, info: &DeviceInfo) -> Option<DeviceFault
 /// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not
 /// been released yet.
 fn has(info: &DeviceInfo, entry: &Entry, crcs: [u32; 2]) -> bool {
-    let its = info.programs.iter().find(|its| its.number == entry.program);
-    let is_there = its.is_some_and(|its| {
-        its.state() != Some(ProgramState::Absent)
-            && its.crc.is_some_and(|crc| crc != 0 && crcs.contains(&crc))
+    let installed = info.programs.iter().find(|installed| installed.number == entry.program);
+    let is_there = installed.is_some_and(|installed| {
+        installed.state() != Some(ProgramState::Absent)
+            && installed.crc.is_some_and(|crc| crc != 0 && crcs.contains(&crc))
     });
     !info.device_type.is_bootloader() && is_there
 }
@@ -299,13 +299,13 @@ fn has(info: &DeviceInfo, entry: &Entry, crcs: [u32; 2]) -> bool {
 /// Whether the device has this bootloader. The CRC of a sealed one is not known here, and an application
 /// need not report any: then the version decides.
 fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &Payload) -> bool {
-    let Some(its) = info.bootloader else { return false };
+    let Some(old) = info.bootloader else { return false };
     // One on trial has to be confirmed.
     let is_settled =
-        its.running.is_none_or(|running| running.progress.state != shared_abi::renewal::State::Staged);
+        old.running.is_none_or(|running| running.progress.state != shared_abi::renewal::State::Staged);
     let is_same = match (new, has.crc) {
         (Payload::Bootloader(_), Some(crc)) if crc != 0 => crc == new.crc(),
-        _ => Some(its.version) == new.bootloader(),
+        _ => Some(old.version) == new.bootloader(),
     };
     is_settled && is_same
 }
@@ -313,17 +313,17 @@ fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &Payload) -> bool {
 /// What the device has and what it gets: their versions, if both have one and these differ, and otherwise
 /// their CRCs.
 fn versions(info: &DeviceInfo, entry: &Entry, program: &Payload) -> (Option<String>, String) {
-    let its = info.programs.iter().find(|its| its.number == entry.program);
-    let its = its.filter(|its| its.state() != Some(ProgramState::Absent));
+    let installed = info.programs.iter().find(|installed| installed.number == entry.program);
+    let installed = installed.filter(|installed| installed.state() != Some(ProgramState::Absent));
     let has = match info.bootloader.filter(|_| entry.is_bootloader()) {
         Some(bootloader) => Some(bootloader.version.to_string()),
-        None => its.and_then(ProgramInfo::release).map(|version| version.to_string()),
+        None => installed.and_then(ProgramInfo::release).map(|version| version.to_string()),
     };
     let crc = |crc: u32| format!("CRC {crc:08X}h");
     match (has, version(program)) {
         (Some(has), Some(gets)) if has != gets || entry.is_bootloader() => (Some(has), gets),
-        (None, Some(gets)) if its.is_none() => (None, gets),
-        _ => (its.and_then(|its| its.crc).filter(|crc| *crc != 0).map(crc), crc(program.crc())),
+        (None, Some(gets)) if installed.is_none() => (None, gets),
+        _ => (installed.and_then(|it| it.crc).filter(|crc| *crc != 0).map(crc), crc(program.crc())),
     }
 }
 

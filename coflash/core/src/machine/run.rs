@@ -96,7 +96,7 @@ pub fn run(
                         ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));
                     }
                     Todo::Update => match is_the_same(adapter, entry, device, options) {
-                        Ok(its) => due.push((node, its)),
+                        Ok(target) => due.push((node, target)),
                         Err(bad) => ended.push((node, Err(bad))),
                     },
                 }
@@ -147,7 +147,7 @@ fn is_the_same(
         // What runs now has said it: the bootloader may report less than the application did in the plan.
         None => Ok(entry.identity.map_or_else(
             || Target { vendor_id: now[0].unwrap_or(0), product_code: now[1].unwrap_or(0) },
-            |its| Target { vendor_id: its.vendor, product_code: its.product },
+            |identity| Target { vendor_id: identity.vendor, product_code: identity.product },
         )),
     }
 }

@@ -155,8 +155,9 @@ pub(super) fn covered(signers: &[Signer], manifest: &Manifest) -> Result<(), Sig
             continue;
         }
         let what = |signer: &Signer| {
-            let its = signer.certificate()?;
-            Some((signer.key, SignatureFault::allowed(its.role(), its.vendor_id(), its.product_code())))
+            let certificate = signer.certificate()?;
+            let (vendor, product) = (certificate.vendor_id(), certificate.product_code());
+            Some((signer.key, SignatureFault::allowed(certificate.role(), vendor, product)))
         };
         let (key, what) = signers.iter().find_map(what).unwrap_or_default();
         return Err(SignatureFault::NotAllowed { key, what, program: entry.name.clone() });

@@ -11,7 +11,7 @@ use super::options::FlashOptions;
 use super::payload::{refusal_number, Payload};
 use super::steps::compare_target;
 use crate::advice::Advice;
-use crate::device::access::{reported_challenge, security_of, takes_open, Challenge};
+use crate::device::access::{challenge, security_of, takes_open, Challenge};
 use crate::device::error::{reported, Error, IdentityPart};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Form, Session};
@@ -155,7 +155,7 @@ fn admit_manifest(session: &mut Session<'_>, file: &SealedFile, program: u8) -> 
 /// Checks what the bootloader reports and an application may not: whether the device accepts sealed
 /// images, and of which age. Returns whether the device has reported it.
 fn takes_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<bool, Error> {
-    match reported_challenge(session)? {
+    match reported(challenge(session))? {
         Some(challenge) if !challenge.is_sealed() => {
             let why = "cannot be installed: the device is not sealed and has no keys to check the image";
             Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice: Advice::Provision })

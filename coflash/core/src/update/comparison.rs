@@ -13,7 +13,7 @@ use seal::access::event;
 use serde::Serialize;
 use shared_abi::block_file::ProgramVersion;
 
-use crate::device::access::{events, reported_challenge};
+use crate::device::access::{challenge, events};
 use crate::device::error::{reported, Error};
 use crate::device::{DeviceType, Session};
 use crate::file::sealed::show::digits;
@@ -169,7 +169,7 @@ fn compare_access(
     file: &SealedFile,
     comparison: &mut Comparison,
 ) -> Result<(), Error> {
-    match reported_challenge(session)? {
+    match reported(challenge(session))? {
         Some(challenge) => {
             let only_for = file.head().unique_id();
             if only_for != [0; 12] {

@@ -8,12 +8,14 @@ use embedded_can::Frame as _;
 use kit::fake::NODE;
 
 type Received = Result<Option<Frame>, AdapterError>;
+type OnSend<'t, A> = dyn FnMut(&mut A, &Frame) + 't;
+type Receive<'t, A> = dyn FnMut(&mut A, Duration) -> Received + 't;
 
 /// An adapter whose frames a test sees before they are sent, or receives in the place of the tool.
 pub struct Tap<'t, A> {
     pub of: A,
-    on_send: Box<dyn FnMut(&mut A, &Frame) + 't>,
-    receive: Box<dyn FnMut(&mut A, Duration) -> Received + 't>,
+    on_send: Box<OnSend<'t, A>>,
+    receive: Box<Receive<'t, A>>,
 }
 
 impl<'t, A: Adapter + 't> Tap<'t, A> {

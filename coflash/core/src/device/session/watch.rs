@@ -197,8 +197,8 @@ mod tests {
         // Another tool: another request, the same request after the answer, and the same request
         // twice.
         assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x605, clear)]), at(0x1F51, 1));
-        let behind = [(true, 0x605, READ), (false, 0x585, ANSWER), (false, 0x605, READ)];
-        assert_eq!(foreign(&behind), at(0x1000, 0));
+        let after = [(true, 0x605, READ), (false, 0x585, ANSWER), (false, 0x605, READ)];
+        assert_eq!(foreign(&after), at(0x1000, 0));
         let twice = [(true, 0x605, READ), (false, 0x605, READ), (false, 0x605, READ)];
         assert_eq!(foreign(&twice), at(0x1000, 0));
         // A segment does not name its object.

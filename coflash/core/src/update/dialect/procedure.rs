@@ -123,6 +123,6 @@ pub(super) fn call_back(
     update.report(Phase::CallingBack.into());
     let running = steps::call_back(session)?;
     update.report(Phase::InBootloader.into());
-    let its = Dialect::of_bootloader(running, session.node());
-    Ok(update.options.dialect.or(its).unwrap_or(found.dialect))
+    let reported = Dialect::of_bootloader(running, session.node());
+    Ok(update.options.dialect.or(reported).unwrap_or(found.dialect))
 }

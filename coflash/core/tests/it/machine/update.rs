@@ -219,7 +219,7 @@ fn a_device_that_was_exchanged_is_not_written() {
     let mut finished = Bus(vec![device(5, 1234), device(6, 1234)]);
     finished.0.iter_mut().for_each(|fake| fake.crc_of_application = Some(CRC));
     let had = planned(&mut finished, &package);
-    assert!(words(&carried_out(&mut finished, &package, &had)).iter().all(|its| its.2 == "had"));
+    assert!(words(&carried_out(&mut finished, &package, &had)).iter().all(|row| row.2 == "had"));
     finished.0[1].maker = Some(Box::new(Plate([63, 1234, 2, 4711])));
     let outcomes = carried_out(&mut finished, &package, &had);
     assert!(matches!(&outcomes[1].result, Err(Bad::Left(fault)) if fault.number() == 0x6000_040C));
@@ -255,8 +255,8 @@ fn a_device_that_is_exchanged_during_the_run_is_not_written() {
         let (first, then) = (Plate([63, 1234, 2, 1005]), Plate([63, 99, 2, 1005]));
         bus.0[0].maker = Some(Box::new(Exchanged { first, then, is_first: true }));
         let outcomes = carried_out(&mut bus, &package, &plan);
-        let its = outcomes.iter().find(|outcome| outcome.node == NodeId::new(5)).unwrap();
-        let Err(Bad::Failed(failed)) = &its.result else { panic!("{:?}", words(&outcomes)) };
+        let outcome = outcomes.iter().find(|outcome| outcome.node == NodeId::new(5)).unwrap();
+        let Err(Bad::Failed(failed)) = &outcome.result else { panic!("{:?}", words(&outcomes)) };
         assert!(matches!(failed.error, Error::WrongTarget { .. }), "{:?}", failed.error);
         assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
     }

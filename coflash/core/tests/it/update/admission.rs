@@ -15,9 +15,6 @@ const START: u32 = 0x0801_0000;
 const VENDOR: u32 = 0x3F;
 const PRODUCT: u32 = 1234;
 
-const DIALECTS: [Dialect; 5] =
-    [Dialect::Block, Dialect::Raw, Dialect::Hex, Dialect::Lift, Dialect::EsAcademy];
-
 /// A program of 1 KiB with a label (`shared-abi/src/label.rs`, written here from the page about it:
 /// 32 bytes at 1E0h, "CBL1", vendor-ID, product code, version, three zeros, and a check word).
 fn labelled(vendor_id: u32, product_code: u32) -> Vec<u8> {
@@ -72,7 +69,7 @@ fn another_devices_label_is_refused_in_every_dialect() {
         (0, PRODUCT + 1, 0x6000_0182, "the program is for product code 000004D3h, and node 5 has 000004D2h"),
         (0x40, PRODUCT, 0x6000_0180, "the program is for vendor-ID 00000040h, and node 5 has 0000003Fh"),
     ] {
-        for dialect in DIALECTS {
+        for dialect in Dialect::ALL {
             for running in [APPLICATION, BOOTLOADER] {
                 // By block 0, which has what the label has; and by the label alone.
                 for reported in [Told::default(), Told::None] {
@@ -208,7 +205,7 @@ fn what_can_be_no_program_is_refused_in_every_dialect() {
         (with(4, START - 0xFFF), START, "the image is not a program: its reset vector is 0800F001h, outside"),
     ] {
         let file = file(&bytes, at, Told::default());
-        for dialect in DIALECTS {
+        for dialect in Dialect::ALL {
             let error = refused(&mut Fake::new(APPLICATION), &file, speaks(dialect));
             assert!(error.to_string().starts_with(words), "{error}");
             assert_eq!(error.number(), 0x6000_0021);
@@ -245,7 +242,7 @@ fn at(base: u32, size: u32, running: u32, while_running: &[u32]) -> Fake {
 fn what_is_for_another_place_than_the_devices_is_refused() {
     const BOTH: [u32; 2] = [APPLICATION, BOOTLOADER];
     let file = file(&labelled(VENDOR, PRODUCT), START, Told::default());
-    for dialect in DIALECTS {
+    for dialect in Dialect::ALL {
         for running in BOTH {
             // Elsewhere, and too small.
             for (base, size) in [(START + 0x1_0000, 0x1_0000), (START, 1020)] {

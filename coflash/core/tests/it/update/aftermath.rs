@@ -69,11 +69,11 @@ fn a_call_that_fails_has_changed_nothing() {
 /// A refused CLEAR erases nothing.
 #[test]
 fn a_refusal_before_the_erasure_leaves_the_old_program() {
-    for its in STANDARD {
+    for kind in STANDARD {
         for outcome in [Outcome::Abort(0x0800_0022), Outcome::AbortStatus(0x0800_0020, 0x84)] {
-            let options = dialect(its);
+            let options = dialect(kind);
             let there = left(BOOTLOADER, &on_command(CLEAR, outcome), options);
-            assert_eq!(there.state, DeviceState::Untouched, "{its}, {outcome:?}");
+            assert_eq!(there.state, DeviceState::Untouched, "{kind}, {outcome:?}");
             let words = there.to_string();
             assert!(words.starts_with("its bootloader is running; it was not changed"), "{words}");
         }
@@ -94,12 +94,12 @@ fn a_refusal_before_the_erasure_leaves_the_old_program() {
 /// A device that erases with the first good data, and receives none, keeps its program.
 #[test]
 fn what_the_device_still_has_is_told() {
-    for its in STANDARD {
+    for kind in STANDARD {
         // The first block, or the first segment of what is sent as a whole.
         let refuses = |crc| {
             move |fake: &mut Fake| {
                 fake.crc = crc;
-                if its == Dialect::Block {
+                if kind == Dialect::Block {
                     fake.on_block = Box::new(|_| Outcome::Abort(0x0606_0000));
                 } else {
                     fake.knows_blocks = kit::fake::Blocks::Known(127);
@@ -107,15 +107,15 @@ fn what_the_device_still_has_is_told() {
                 }
             }
         };
-        let there = left(BOOTLOADER, &refuses(Some(0x0BAD_CAFE)), dialect(its));
-        assert_eq!(there.state, DeviceState::Untouched, "{its}");
+        let there = left(BOOTLOADER, &refuses(Some(0x0BAD_CAFE)), dialect(kind));
+        assert_eq!(there.state, DeviceState::Untouched, "{kind}");
         assert_eq!(
             there.to_string(),
             "its bootloader is running; it was not changed (CRC 0BADCAFEh)",
-            "{its}"
+            "{kind}"
         );
-        let gone = left(BOOTLOADER, &refuses(None), dialect(its));
-        assert_eq!(gone.state, DeviceState::Erased, "{its}");
+        let gone = left(BOOTLOADER, &refuses(None), dialect(kind));
+        assert_eq!(gone.state, DeviceState::Erased, "{kind}");
         assert_eq!(gone.to_string(), "its bootloader is running; it contains no complete program");
     }
     // In the middle of the program the previous CRC no longer counts.
@@ -131,13 +131,13 @@ fn what_the_device_still_has_is_told() {
 
 #[test]
 fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
-    for its in STANDARD {
+    for kind in STANDARD {
         let dies = |fake: &mut Fake| {
             fake.erase_time = Duration::from_secs(100_000);
             fake.deaf_while_busy = true;
         };
-        let gone = left(BOOTLOADER, &dies, dialect(its));
-        assert_eq!((gone.state, gone.answer), (DeviceState::Erased, DeviceAnswer::Silent), "{its}");
+        let gone = left(BOOTLOADER, &dies, dialect(kind));
+        assert_eq!((gone.state, gone.answer), (DeviceState::Erased, DeviceAnswer::Silent), "{kind}");
         assert_eq!(gone.to_string(), "it does not answer; last known: it contains no complete program");
     }
     let mut fake = Fake::new(BOOTLOADER);
@@ -152,19 +152,19 @@ fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
 /// cannot say that there is none. One that was long about the erase has none.
 #[test]
 fn without_an_answer_a_postponed_erase_is_not_called_done() {
-    for its in STANDARD {
+    for kind in STANDARD {
         let postpones = |fake: &mut Fake| fake.erase_time = Duration::ZERO;
         let mut whole = Fake::new(BOOTLOADER);
         postpones(&mut whole);
-        let _ = run(&mut whole, &dialect(its));
+        let _ = run(&mut whole, &dialect(kind));
         let command = |command| {
             let request = [0x2F, 0x51, 0x1F, 1, command, 0, 0, 0];
             whole.sent.iter().position(|frame| frame.exactly::<8>() == Some(&request))
         };
         // CLEAR and the read of 1F57h; the last is lost before the program is complete.
         let begin = command(CLEAR).unwrap() + 2;
-        let first = left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = begin).0, dialect(its));
-        assert_eq!((first.state, first.answer), (DeviceState::Postponed, DeviceAnswer::NotAsked), "{its}");
+        let first = left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = begin).0, dialect(kind));
+        assert_eq!((first.state, first.answer), (DeviceState::Postponed, DeviceAnswer::NotAsked), "{kind}");
         assert_eq!(
             first.to_string(),
             "it cannot be asked any more; last known: it erases its program with the first good data, and has \
@@ -173,14 +173,14 @@ fn without_an_answer_a_postponed_erase_is_not_called_done() {
         let mut states = Vec::new();
         for frames in begin..command(1).unwrap_or(whole.sent.len()) {
             states.push(
-                left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = frames).0, dialect(its)).state,
+                left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = frames).0, dialect(kind)).state,
             );
-            let slow = left(BOOTLOADER, &|fake| fake.frames_left = begin, dialect(its));
-            assert_eq!(slow.state, DeviceState::Erased, "{its}");
+            let slow = left(BOOTLOADER, &|fake| fake.frames_left = begin, dialect(kind));
+            assert_eq!(slow.state, DeviceState::Erased, "{kind}");
         }
         states.dedup();
-        assert_eq!(states[..2], [DeviceState::Postponed, DeviceState::Erased], "{its}: {states:?}");
-        assert!(!states[2..].contains(&DeviceState::Postponed), "{its}: {states:?}");
+        assert_eq!(states[..2], [DeviceState::Postponed, DeviceState::Erased], "{kind}: {states:?}");
+        assert!(!states[2..].contains(&DeviceState::Postponed), "{kind}: {states:?}");
     }
 }
 

@@ -8,11 +8,12 @@ use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::Dialect;
+use coflash_core::file::block_file;
 use coflash_core::update::event::{Note, Warning};
 use coflash_core::update::{Event, FlashOptions, Password, Report};
 use coflash_core::Error;
 
-use super::{file, update};
+use super::update;
 use crate::tap::Tap;
 use kit::fake::{Deed, Fake, Maker, APPLICATION, NODE};
 
@@ -60,7 +61,8 @@ fn lift() -> Fake {
 }
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    update(adapter, file(), options)
+    // A program that names no product.
+    update(adapter, block_file::read(data!("plain-400.blk")).unwrap(), options)
 }
 
 /// Whether an event begins with this text.
