@@ -94,11 +94,6 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
 
-/// Whether an object belongs to an update: a master that writes it is at work.
-const fn is_of_update(index: u16) -> bool {
-    matches!(index, PROGRAM_DATA | PROGRAM_CONTROL | ENABLE_FLASH | UNLOCK | ACCESS | ROM_LOADER)
-}
-
 /// So long after the start, or after the last work on the flash, the device is idle, in ms: a master that has
 /// something to do has begun with it.
 const IDLE_MS: u32 = 1000;
@@ -412,7 +407,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if let Some(written) = self.emcy.write(at, data) {
             return written;
         }
-        self.is_asked |= is_of_update(at.index);
+        // All other objects that can be written belong to an update.
+        self.is_asked |= !C::SECOND_SERVER || at.index != SECOND_SERVER;
         match (at.index, data) {
             (ACCESS, request) if C::SEALED => {
                 if self.signatures.is_waiting(self.now) {
@@ -445,7 +441,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        self.is_asked |= is_of_update(at.index);
+        self.is_asked = true;
         if C::SEALED && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }

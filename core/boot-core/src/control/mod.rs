@@ -399,7 +399,24 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
                 }
             }
             Some(Event::Stored { program, ends }) => {
-                self.take_record(flash, program, ends && is_same);
+                let (record, partial) = load::<C>(&self.parameters, flash, program, &self.rights);
+                if C::RENEWS {
+                    self.note_record(program, record);
+                }
+                if let Some(state) = find::<C>(&mut self.programs, program) {
+                    state.record = record;
+                    state.date = date::<C>(&self.parameters, flash, program, state.region, record);
+                    if record.is_none() {
+                        state.identification = 0;
+                    }
+                    let open = matches!(state.session, Session::Open { .. });
+                    if !open {
+                        state.partial = partial;
+                    }
+                    if ends && open && is_same {
+                        state.session = Session::Idle;
+                    }
+                }
                 if ends {
                     self.end(program, Ok(()));
                 }
@@ -429,28 +446,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
             }
         }
         step
-    }
-
-    /// The record of a program was stored or removed. `ends_session`: a sealed image that was installed already
-    /// ends its download.
-    fn take_record<F: Flash>(&mut self, flash: &F, program: u8, ends_session: bool) {
-        let (record, partial) = load::<C>(&self.parameters, flash, program, &self.rights);
-        if C::RENEWS {
-            self.note_record(program, record);
-        }
-        let Some(state) = find::<C>(&mut self.programs, program) else { return };
-        state.record = record;
-        state.date = date::<C>(&self.parameters, flash, program, state.region, record);
-        if record.is_none() {
-            state.identification = 0;
-        }
-        let open = matches!(state.session, Session::Open { .. });
-        if !open {
-            state.partial = partial;
-        }
-        if open && ends_session {
-            state.session = Session::Idle;
-        }
     }
 
     /// A program was written completely, with this CRC in flash: stores its record.

@@ -5,7 +5,7 @@ use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
 use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
-use canopen::od::{Address, Objects};
+use canopen::od::Objects;
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
 use kit::bench::*;

@@ -413,7 +413,7 @@ fn who_writes_an_object_of_an_update_holds_the_device() {
         (0x2002, 2, &[0; 4], true),
         (0x2008, 0, b"none", true),
         (0x1201, 1, &[0; 4], false),
-        (0x1014, 0, &[0; 4], false),
+        (0x1003, 0, &[0], false),
     ];
     for (index, sub, data, holds) in cases {
         let mut node = with_choices::<Everything>(new_flash());
@@ -427,11 +427,11 @@ fn who_writes_an_object_of_an_update_holds_the_device() {
 }
 
 /// A bootloader with this report of the boot stage.
-fn reported(
-    flash: &mut ModelFlash,
+fn reported<'f>(
+    flash: &'f mut ModelFlash,
     config: &'static Config,
     report: BootReport,
-) -> Bootloader<'static, &mut ModelFlash, Journal, 1> {
+) -> Bootloader<'static, &'f mut ModelFlash, Journal, 1> {
     let (buffer, sealed) = leaked(256);
     Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), report }.on(flash, buffer, sealed)
 }

@@ -6,7 +6,7 @@ use boot_core::flash::{run, Flash, FlashFault, Operation};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use canopen::od::{Address, Objects};
 use canopen::{BitRate, Instant, NodeId};
-use kit::bench::{node, program, Bench, CLR_SIGNATURE, CONFIG, START};
+use kit::bench::{block, node, program, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, DATA, START};
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
@@ -623,6 +623,42 @@ fn an_idle_bootloader_compacts_its_journal_and_takes_commands_meanwhile() {
         assert_eq!(journal.get(&flash, Key::CRASH_COUNT), Some([used - 1, 0, 0, 0]));
         let record = ProgramRecord::load(&journal, &flash, 1).unwrap();
         assert_eq!(record.signed, !compacts, "{used} used slots, {at_ms} ms");
+    }
+}
+
+/// A compaction waits for a transfer and a download that are open, and for the end of a device that leaves.
+#[test]
+fn a_compaction_waits_for_what_is_open() {
+    type Act = fn(&mut Bench<'_>);
+    let open: [(&str, Act, Act); 3] = [
+        (
+            "transfer",
+            |bench| bench.node.download_start(DATA, None).unwrap(),
+            |bench| bench.node.download_cancel(DATA),
+        ),
+        (
+            "download",
+            |bench| bench.transfer(&block(0, 0, &[0; 8])).unwrap(),
+            |bench| bench.node.write(CONTROL, &[CLEAR]).unwrap(),
+        ),
+        (
+            "start",
+            |bench| bench.node.write(CONTROL, &[START]).unwrap(),
+            |bench| assert!(bench.node.take_boot_request().is_some()),
+        ),
+    ];
+    for (what, begin, end) in open {
+        let mut flash = used_slots(300);
+        let mut bench = called_back(&mut flash, 60_000);
+        bench.node.write(CONTROL, &[CLEAR]).unwrap();
+        begin(&mut bench);
+        for _ in 0..5 {
+            bench.node.step();
+            assert!(!bench.node.is_compacting(), "{what}");
+        }
+        end(&mut bench);
+        bench.node.step();
+        assert!(bench.node.is_compacting(), "{what} is over");
     }
 }
 

@@ -482,6 +482,11 @@ fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
     assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE));
     assert_eq!(node.word(0x1F57), BUSY);
     node.send(1, last).unwrap();
+    // A transfer that has brought nothing yet is one that is open.
+    let at = Address::new(0x1F50, 1);
+    node.0.download_start(at, None).unwrap();
+    assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE));
+    node.0.download_cancel(at);
     assert_eq!(node.command(N, START), 0);
     assert_eq!(node.0.take_boot_request(), Some(BootRequest::Renewal(TrialStep::Try)));
 }

@@ -33,18 +33,12 @@ fn hex(program: &[u8], len: usize, end: &str) -> String {
     text + EOF + end
 }
 
-fn cleared(flash: &mut ModelFlash) -> Bench<'_> {
-    let mut bench = Bench::new(flash);
-    assert_eq!(bench.command(CLEAR), 0);
-    bench
-}
-
 #[test]
 fn a_raw_image_is_stored_is_valid_and_starts() {
     let image = program(3001, 0x11);
     for (size, pieces) in [(Some(3001), 7), (None, 7), (Some(3001), 1), (None, 4)] {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = cleared(&mut flash);
+        let mut bench = Bench::cleared(&mut flash);
         assert_eq!(bench.read_state(), 3, "there is no program");
         assert_eq!(bench.stream(&image, size, pieces), (Ok(()), 0));
         assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
@@ -76,7 +70,7 @@ fn hex_is_stored_whatever_its_records_and_line_ends_are() {
 /// A record for which the device can never have room: refused without a wait.
 #[test]
 fn a_record_that_is_larger_than_half_the_queue_is_refused() {
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     let text = hex(&program(300, 0), 100, "\n");
     assert_eq!(bench.stream(text.as_bytes(), None, 7), (Err(AbortCode(0x0504_0005)), 0x04));
     assert_eq!(bench.stream(hex(&program(300, 0), 64, "\n").as_bytes(), None, 7), (Ok(()), 0));
@@ -97,7 +91,7 @@ fn hex_may_have_gaps_and_any_order() {
     };
     let text = format!("{upper}\n{}{}{}{EOF}\n", part(700, 2000), part(8, 300), part(0, 8));
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.stream(text.as_bytes(), Some(text.len() as u32), 7), (Ok(()), 0));
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
     assert_eq!(autostart(&flash), Ok(0x33));
@@ -110,7 +104,7 @@ fn hex_may_have_gaps_and_any_order() {
 fn a_program_is_fresh_only_right_behind_a_stream() {
     let image = program(500, 0x45);
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     assert_eq!(bench.command(START), 0);
@@ -123,7 +117,7 @@ fn a_program_is_fresh_only_right_behind_a_stream() {
     assert_eq!(bench.node.write(CONTROL, &[START]), Err(AbortCode(0x0800_0022)), "it leaves");
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
 
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     bench.install(&image);
     assert_eq!(bench.command(START), 0);
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
@@ -133,7 +127,7 @@ fn a_program_is_fresh_only_right_behind_a_stream() {
 fn command_2_starts_behind_a_stream_alone() {
     let image = program(500, 0x44);
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = cleared(&mut flash);
+    let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(RESET_STAT), 0);
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
@@ -179,7 +173,7 @@ fn a_profile_may_start_always_or_by_itself_or_want_a_signature() {
 fn start_right_behind_the_last_segment_waits_for_the_verification() {
     let image = program(2000, 0x66);
     for command in [START, RESET_STAT] {
-        let mut bench = cleared(new_flash());
+        let mut bench = Bench::cleared(new_flash());
         assert_eq!(bench.pour(&image, None, 7), Ok(()));
         assert_eq!(bench.status(), 1, "busy");
         assert!(bench.node.is_finishing(), "a reset now would lose the program");
@@ -190,7 +184,7 @@ fn start_right_behind_the_last_segment_waits_for_the_verification() {
         assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
     }
     // A program that fails the verification does not start.
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     assert_eq!(bench.pour(&image, None, 7), Ok(()));
     assert_eq!(bench.node.write(CONTROL, &[START]), Ok(()));
     let operations = bench.node.flash().operations;
@@ -287,7 +281,7 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
     ];
     for (what, data, abort, status) in cases {
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = cleared(&mut flash);
+        let mut bench = Bench::cleared(&mut flash);
         assert_eq!(bench.stream(&data, None, 7), (Err(abort), status), "{what}");
         assert_eq!(bench.read_state(), 3, "{what}");
         assert_eq!(bench.command(START), 2, "{what}: NOVALPROG");
@@ -305,7 +299,7 @@ fn what_is_seen_later_leaves_no_program_and_the_next_attempt_works() {
 fn a_place_that_is_written_twice_is_not_blank() {
     let image = program(600, 0xA0);
     let text = hex(&image, 16, "\n").replace(EOF, &(record(0x0900, 0, &[0]) + EOF));
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     assert_eq!(bench.stream(text.as_bytes(), None, 7), (Ok(()), 0x08), "NOTCLEARED");
     assert_eq!(bench.command(START), 2, "NOVALPROG");
     assert_eq!(bench.command(CLEAR), 0);
@@ -315,7 +309,7 @@ fn a_place_that_is_written_twice_is_not_blank() {
 #[test]
 fn a_client_that_breaks_off_leaves_no_program() {
     let image = program(3000, 0xA1);
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     // Before a piece is complete nothing is lost, and the download may begin again at once.
     bench.begin(&image[..14]);
     bench.node.download_cancel(DATA);
@@ -339,7 +333,7 @@ fn stop_counts_as_clear_for_one_download_in_one_transfer() {
     let image = program(1500, 0xB3);
     let text = hex(&image, 16, "\n");
     let mut flash = ModelFlash::new(&CHIP);
-    cleared(&mut flash).install(&program(600, 0x11));
+    Bench::cleared(&mut flash).install(&program(600, 0x11));
     for _ in 0..2 {
         for data in [&image[..], text.as_bytes()] {
             let mut bench = Bench::new(&mut flash);
@@ -398,7 +392,7 @@ fn stop_counts_as_clear_for_data() {
 fn two_formats_in_one_session_are_refused() {
     let image = program(600, 0xB2);
     let blocks = block_file(&image, 96);
-    let mut bench = cleared(new_flash());
+    let mut bench = Bench::cleared(new_flash());
     bench.good(&blocks[0]);
     assert_eq!(bench.stream(&image, None, 7), (Err(STATE), 0x88));
     assert_eq!(bench.stream(hex(&image, 16, "\n").as_bytes(), None, 7), (Err(STATE), 0x88));
@@ -416,7 +410,7 @@ fn two_formats_in_one_session_are_refused() {
 fn the_flash_fails_under_a_stream() {
     let image = program(3000, 0xC3);
     let fault = |operation: u32| {
-        let mut bench = cleared(new_flash());
+        let mut bench = Bench::cleared(new_flash());
         let before = bench.node.flash().operations;
         bench.node.flash().fail = Some((before + operation, FlashFault::Failed));
         let (outcome, status) = bench.stream(&image, None, 7);
@@ -504,7 +498,7 @@ proptest! {
         let at = cut.index(data.len() + 1);
         data.splice(at..at, rest);
         let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = cleared(&mut flash);
+        let mut bench = Bench::cleared(&mut flash);
         let _ = bench.stream(&data, None, pieces);
         let image = program(700, 0xF1);
         prop_assert_eq!(bench.command(CLEAR), 0);
