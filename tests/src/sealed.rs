@@ -12,7 +12,7 @@ use boot_core::decision::{Exit, Start};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use coflash_core::file::sealed::SigningKey;
-use seal::access::{right, CHALLENGE};
+use seal::access::{right, CHALLENGE, EVENTS};
 use shared_abi::geometry::Region;
 use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::BootRequest;
@@ -171,13 +171,6 @@ impl DerefMut for Host<'_> {
 }
 
 impl Host<'_> {
-    /// Runs this many steps.
-    pub fn steps(&mut self, steps: usize) {
-        for _ in 0..steps {
-            self.node.is_idle_after_step();
-        }
-    }
-
     /// A command, carried out; gives the status.
     pub fn commanded(&mut self, program: u8, command: u8) -> u32 {
         self.command(program, command).expect("the command is taken");
@@ -234,6 +227,18 @@ impl Host<'_> {
     /// A request for rights, signed by this key for the present challenge.
     pub fn request(&mut self, root: &SigningKey, rights: u32, argument: u32) -> Vec<u8> {
         request(&self.challenge(), root, rights, argument)
+    }
+
+    /// An event of 2003h; 1 is the latest.
+    pub fn event(&mut self, sub: u8) -> [u32; 4] {
+        let mut bytes = [0; 16];
+        assert_eq!(self.read(Address::new(0x2003, sub), &mut bytes), Ok(16));
+        [0, 4, 8, 12].map(|at| seal::wire::word(&bytes, at))
+    }
+
+    /// All events, the latest first.
+    pub fn log(&mut self) -> Vec<[u32; 4]> {
+        (1..=EVENTS as u8).map(|sub| self.event(sub)).collect()
     }
 
     /// Sends a request for rights (2002h/2), without waiting for its check.

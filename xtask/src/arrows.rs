@@ -74,7 +74,7 @@ const TESTS: [&str; 3] = ["coboot-tests", "coboot-fuzz", "attack"];
 /// The crates that need no `unsafe` and forbid it to the compiler.
 const PURE: &str =
     "canopen seal boot-core coboot-linker coboot-can coflash-core coflash-conform coflash-agent \
-                    coflash-ui coflash coboot-node kit attack new-board xtask";
+                    coflash-ui coflash coboot-node attack new-board xtask";
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

@@ -54,6 +54,10 @@ pub enum Action {
     Rot(usize, u8),
     /// What a tool does next so that this image becomes the bootloader: data, START or 83h.
     Renew(Content),
+    /// On a bus: so many frames of the device are destroyed from now on.
+    Disturb(u64),
+    /// On a serial line: bytes of this seed, which are no frame.
+    Scramble(u64),
 }
 
 impl Action {

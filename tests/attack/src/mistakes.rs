@@ -5,15 +5,15 @@ use std::task::Poll;
 use boot_core::bootloader::Everything;
 use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
-use kit::boot::{leaked, Boot};
+use kit::boot::Boot;
 use kit::model::Chip;
-use kit::rig::{crc32, Node, Rig, Setup, AT_ONCE_2, BOARD_NODE, STANDARD_2};
+use kit::rig::{crc32, Owned, Rig, Setup, AT_ONCE_2, BOARD_NODE, STANDARD_2};
 use shared_abi::geometry::Sector;
 use shared_abi::layout::Layout;
 
 use crate::files::{file, NEW};
 
-/// A mistake, in a device of [`STANDARD_2`].
+/// A mistake, in a device with two programs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mistake {
     /// The record of the new program is stored and released before its data are complete.
@@ -30,20 +30,13 @@ pub enum Mistake {
     BlankAtFirstSight,
     /// Half erased sectors are not recorded.
     TouchedForgotten,
+    /// Each record of a program says that it is released.
+    ReleasedByItself,
+    /// The security counter of a sealed program is not stored.
+    CounterForgotten,
 }
 
 impl Mistake {
-    /// All of them.
-    pub const ALL: [Self; 7] = [
-        Self::SignatureBeforeData,
-        Self::EraseBeforeInvalidating,
-        Self::EraseBeforeCheck,
-        Self::JournalWithoutCrc,
-        Self::CompactionInPlace,
-        Self::BlankAtFirstSight,
-        Self::TouchedForgotten,
-    ];
-
     /// The product that the device is in truth.
     pub(crate) fn setup(self, setup: &'static Setup) -> &'static Setup {
         if self == Self::EraseBeforeCheck {
@@ -54,17 +47,18 @@ impl Mistake {
     }
 
     /// The bootloader with the mistake.
-    pub(crate) fn node(self, rig: &Rig) -> Option<Box<dyn Node>> {
+    pub(crate) fn node(self, rig: &Rig) -> Option<Owned> {
         if self == Self::EraseBeforeCheck {
             return None;
         }
         let chip = rig.chip.clone();
         let store = Store::open(&chip, rig.setup.layout, Some(self));
         let node = NodeParameters::load(&store, &chip, BOARD_NODE, |_| true);
-        let (buffer, sealed) = leaked(256);
         let flash = Hasty { chip, is_hasty: self == Self::BlankAtFirstSight };
         let boot = Boot::new(&rig.setup.config, node);
-        Some(Box::new(boot.with::<_, _, 2, Everything>(store, flash, buffer, sealed)))
+        Some(Owned::new(2048, rig.setup.takes_sealed, |buffer, sealed| {
+            Box::new(boot.with::<_, _, 2, Everything>(store, flash, buffer, sealed))
+        }))
     }
 }
 
@@ -99,11 +93,41 @@ impl Flash for Hasty {
     }
 }
 
+/// What is stored in place of a value; `None` for nothing.
+type Change = fn(Key, Value) -> Option<Value>;
+
+/// Whether this removes the record of program 1.
+fn removes(key: Key, value: Value) -> bool {
+    key == Key::program(1) && ProgramRecord::from_value(value).is_none()
+}
+
+/// The record of the new program, released.
+fn new_record() -> Value {
+    let new = file(&STANDARD_2, NEW);
+    let record = ProgramRecord {
+        size: new.plain.len() as u32,
+        crc: new.crc,
+        signed: true,
+        confirmed: false,
+        version: 0,
+        half_erased: false,
+        seal: None,
+        withdrawn: false,
+    };
+    record.value()
+}
+
+/// The same record, released.
+fn released(key: Key, value: Value) -> Value {
+    let record = ProgramRecord::from_value(value).filter(|_| [1, 2].map(Key::program).contains(&key));
+    record.map_or(value, |record| ProgramRecord { signed: true, ..record }.value())
+}
+
 /// The journal, or a faulty replacement of it.
 pub enum Store {
     Journal(Journal),
-    /// Stores this record instead of removing one, or does not remove it.
-    Instead(Journal, Option<Value>),
+    /// Stores something else, or nothing.
+    Changed(Journal, Change),
     /// Forgets which sectors may be half erased.
     Forgetful(Journal),
     /// One region with consecutive records; a word before each record identifies it. `checked`: a
@@ -120,22 +144,19 @@ impl Store {
         match mistake {
             Some(Mistake::JournalWithoutCrc) => Self::Naive { checked: false, work: Vec::new() },
             Some(Mistake::CompactionInPlace) => Self::Naive { checked: true, work: Vec::new() },
-            Some(Mistake::EraseBeforeInvalidating) => Self::Instead(journal, None),
             Some(Mistake::TouchedForgotten) => Self::Forgetful(journal),
-            Some(Mistake::SignatureBeforeData) => {
-                let new = file(&STANDARD_2, NEW);
-                let record = ProgramRecord {
-                    size: new.plain.len() as u32,
-                    crc: new.crc,
-                    signed: true,
-                    confirmed: false,
-                    version: 0,
-                    half_erased: false,
-                    seal: None,
-                    withdrawn: false,
-                };
-                Self::Instead(journal, Some(record.value()))
+            Some(Mistake::EraseBeforeInvalidating) => {
+                Self::Changed(journal, |key, value| (!removes(key, value)).then_some(value))
             }
+            Some(Mistake::SignatureBeforeData) => Self::Changed(journal, |key, value| {
+                Some(if removes(key, value) { new_record() } else { value })
+            }),
+            Some(Mistake::ReleasedByItself) => {
+                Self::Changed(journal, |key, value| Some(released(key, value)))
+            }
+            Some(Mistake::CounterForgotten) => Self::Changed(journal, |key, value| {
+                (![1, 2].map(Key::counter).contains(&key)).then_some(value)
+            }),
             _ => Self::Journal(journal),
         }
     }
@@ -172,7 +193,7 @@ fn naive_records<F: Flash>(flash: &F, checked: bool) -> (Vec<[u32; NAIVE]>, u32)
 impl Parameters for Store {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
         match self {
-            Self::Journal(journal) | Self::Instead(journal, _) => journal.get(flash, key),
+            Self::Journal(journal) | Self::Changed(journal, _) => journal.get(flash, key),
             Self::Forgetful(journal) => {
                 let [first, rest @ ..] = journal.get(flash, key)?;
                 let [a, b, c] = rest;
@@ -194,16 +215,12 @@ impl Parameters for Store {
 
     fn store(&mut self, key: Key, value: Value) {
         match self {
-            Self::Instead(journal, instead)
-                if key == Key::program(1) && ProgramRecord::from_value(value).is_none() =>
-            {
-                if let Some(instead) = instead {
-                    journal.store(key, *instead);
+            Self::Changed(journal, change) => {
+                if let Some(value) = change(key, value) {
+                    journal.store(key, value);
                 }
             }
-            Self::Journal(journal) | Self::Instead(journal, _) | Self::Forgetful(journal) => {
-                journal.store(key, value);
-            }
+            Self::Journal(journal) | Self::Forgetful(journal) => journal.store(key, value),
             Self::Naive { work, .. } => {
                 let mut record = vec![naive_key(key), value[0], value[1], value[2], value[3]];
                 record.push(naive_crc(&record));
@@ -215,7 +232,7 @@ impl Parameters for Store {
 
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         let Self::Naive { checked, work } = self else {
-            let (Self::Journal(journal) | Self::Instead(journal, _) | Self::Forgetful(journal)) = self else {
+            let (Self::Journal(journal) | Self::Changed(journal, _) | Self::Forgetful(journal)) = self else {
                 unreachable!()
             };
             return journal.next(flash, outcome);

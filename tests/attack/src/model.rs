@@ -214,7 +214,6 @@ impl Model {
 
     fn perform(&mut self, action: &Action) -> Result<(), AbortCode> {
         let rig = &mut self.rig;
-        let data = |sub| Address::new(0x1F50, sub);
         let mut answer = Ok(());
         match *action {
             Action::Command { sub, value } => answer = rig.command(sub, value),
@@ -222,7 +221,7 @@ impl Model {
                 if let Some((at, password)) = rig.setup.password(sub) {
                     let mut password = password.to_vec();
                     password[0] ^= u8::from(!is_right);
-                    answer = rig.node.write(at, &password);
+                    answer = rig.write(at, &password);
                 }
             }
             Action::Send { sub, sent, is_announced, bytes } => {
@@ -245,14 +244,7 @@ impl Model {
                     answer = rig.node.read(at, &mut [0; 64]).map(drop);
                 }
             }
-            Action::Upload { sub } if rig.setup.has(sub) && rig.setup.profile.extras.read_back => {
-                let upload = rig.node.upload_start(data(sub)).and_then(|size| {
-                    let mut bytes = vec![0; size.expect("it is known") as usize];
-                    rig.node.upload_data(data(sub), 0, &mut bytes).map(|read| crc32(&bytes[..read]))
-                });
-                answer = upload.map(|crc| self.read_back = Some(crc));
-            }
-            Action::Upload { .. } => {}
+            Action::Upload { sub } => answer = self.upload(sub),
             Action::Store(id) => {
                 let store = rig.node.store(NodeId::new(id), Some(BitRate::K250));
                 answer = if let Poll::Ready(Err(_)) = store { Err(AbortCode::GENERAL) } else { Ok(()) };
@@ -275,22 +267,12 @@ impl Model {
             }
             Action::Crash => self.reset(ResetCause::IndependentWatchdog, None),
             Action::PowerOff => self.power_off(),
-            Action::Flash(after, trouble) => {
-                let mut flash = rig.chip.model();
-                let at = flash.operations + after;
-                match trouble {
-                    Trouble::Cut(cut) => flash.cut = Some((at, cut)),
-                    Trouble::Dip => flash.low_from = Some(at),
-                    Trouble::Fail(fault) => flash.fail = Some((at, fault)),
-                    Trouble::Weak(seed) => flash.weak = Some((at, seed)),
-                    Trouble::None => {
-                        (flash.cut, flash.fail, flash.weak, flash.low_from) = (None, None, None, None);
-                    }
-                }
-            }
+            Action::Flash(after, trouble) => self.trouble(after, trouble),
             Action::Supply => rig.chip.model().low_from = None,
             Action::Rot(at, bits) => self.rot(at, bits),
             Action::Renew(_) => unreachable!("it is several"),
+            // It has no bus.
+            Action::Disturb(_) | Action::Scramble(_) => {}
         }
         // A request to leave the bootloader. A program that starts comes back.
         if let Some(request) = self.rig.node.take_boot_request() {
@@ -301,6 +283,31 @@ impl Model {
             self.request = Some(request);
         }
         answer
+    }
+
+    /// Reads a program back, if the device permits it.
+    fn upload(&mut self, sub: u8) -> Result<(), AbortCode> {
+        let (rig, at) = (&mut self.rig, Address::new(0x1F50, sub));
+        if rig.setup.has(sub) && rig.setup.profile.extras.read_back {
+            let size = rig.upload_start(at)?.expect("it is known");
+            let mut bytes = vec![0; size as usize];
+            let read = rig.upload_data(at, 0, &mut bytes)?;
+            self.read_back = Some(crc32(&bytes[..read]));
+        }
+        Ok(())
+    }
+
+    /// So many flash operations later there is trouble.
+    fn trouble(&mut self, after: u32, trouble: Trouble) {
+        let mut flash = self.rig.chip.model();
+        let at = flash.operations + after;
+        match trouble {
+            Trouble::Cut(cut) => flash.cut = Some((at, cut)),
+            Trouble::Dip => flash.low_from = Some(at),
+            Trouble::Fail(fault) => flash.fail = Some((at, fault)),
+            Trouble::Weak(seed) => flash.weak = Some((at, seed)),
+            Trouble::None => (flash.cut, flash.fail, flash.weak, flash.low_from) = (None, None, None, None),
+        }
     }
 
     /// Asks a sealed device for rights.

@@ -65,19 +65,19 @@ fn nor_while_the_journal_changes_over() {
 /// In the scenario for this mistake: by a cut, unless a probe would find it after an action, too.
 #[test]
 fn a_cut_shows_every_seeded_bug_where_it_should() {
-    for mistake in Mistake::ALL {
-        let (name, by_cut, within) = match mistake {
-            Mistake::SignatureBeforeData | Mistake::EraseBeforeInvalidating => {
-                ("update", false, "data are not changed while a record for them is valid")
-            }
-            // CLEAR alone loses nothing: a cut in it leaves the old program.
-            Mistake::EraseBeforeCheck => {
-                ("update", false, "a program is lost by CLEAR or by accepted data alone")
-            }
-            Mistake::JournalWithoutCrc | Mistake::CompactionInPlace => ("compaction", true, "not true that"),
-            Mistake::BlankAtFirstSight => ("update", true, "the recovery does not complete"),
-            Mistake::TouchedForgotten => ("erase-and-install", true, "the recovery does not complete"),
-        };
+    use Mistake::*;
+    let changed = "data are not changed while a record for them is valid";
+    let unfinished = "the recovery does not complete";
+    for (mistake, name, by_cut, within) in [
+        (SignatureBeforeData, "update", false, changed),
+        (EraseBeforeInvalidating, "update", false, changed),
+        // CLEAR alone loses nothing: a cut in it leaves the old program.
+        (EraseBeforeCheck, "update", false, "a program is lost by CLEAR or by accepted data alone"),
+        (JournalWithoutCrc, "compaction", true, "not true that"),
+        (CompactionInPlace, "compaction", true, "not true that"),
+        (BlankAtFirstSight, "update", true, unfinished),
+        (TouchedForgotten, "erase-and-install", true, unfinished),
+    ] {
         let shown = shows(scenario(name), mistake);
         println!("{mistake:?} in {name}: {shown:?}");
         let what = match &shown {

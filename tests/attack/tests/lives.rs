@@ -7,6 +7,7 @@
 
 use attack::device::{Action, Trouble};
 use attack::files::{file, Content, Extent, Part};
+use attack::mistakes::Mistake;
 use attack::model::Model;
 use attack::play::{attack, play, Failure, Met};
 use attack::script;
@@ -71,6 +72,26 @@ fn whatever_is_done_what_starts_is_authentic() {
     let met = attacks([&sealed::STANDARD_1].into_iter().chain(of_two), 100, &[(2048, 0)]);
     // The attack is on a working device.
     assert!(environment("COBOOT_ATTACK_SEED").is_some() || met.programs > 300, "{}", met.programs);
+}
+
+/// No cut shows these: the rules find them in the lives of a device that has one.
+#[test]
+fn a_life_shows_a_seeded_bug_by_its_rule() {
+    for (mistake, setup, rule) in [
+        (
+            Mistake::ReleasedByItself,
+            &STANDARD_2,
+            "a program is released by 83h or by a transfer of all of it",
+        ),
+        (Mistake::CounterForgotten, &sealed::STANDARD_2, "no program is there before its security counter"),
+    ] {
+        let flash = Model::new(setup, 2048, 0).flash();
+        let new = || Model::on(setup, 2048, flash.clone(), Some(mistake));
+        let found =
+            (0..100).find_map(|seed| play(new(), &script::of(setup, seed), &mut Met::default()).err());
+        let (_, broken) = found.unwrap_or_else(|| panic!("nothing shows {mistake:?}"));
+        assert_eq!(broken.0, rule, "{mistake:?}: {broken}");
+    }
 }
 
 /// On a device that takes a download without CLEAR a session outlives what it has relied on when it began: an

@@ -57,9 +57,14 @@ impl Boot {
 /// images, too, and has no keys yet: both behave the same.
 const TAKES_SEALED: &str = "COBOOT_TAKES_SEALED";
 
+/// Whether that is set.
+pub(crate) fn takes_sealed() -> bool {
+    std::env::var_os(TAKES_SEALED).is_some()
+}
+
 /// A buffer for blocks, and the memory for sealed images, for a bootloader that lives as long as the test.
 pub fn leaked(buffer: usize) -> (&'static mut [u8], Sealed<'static>) {
-    let takes_sealed = std::env::var_os(TAKES_SEALED).is_some();
-    let sealed = if takes_sealed { Box::leak(Box::<SealedMemory>::default()).sealed() } else { Sealed::NONE };
+    let sealed =
+        if takes_sealed() { Box::leak(Box::<SealedMemory>::default()).sealed() } else { Sealed::NONE };
     (vec![0; buffer].leak(), sealed)
 }

@@ -20,7 +20,7 @@
 //! | `rig` | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
 #![allow(clippy::new_without_default, reason = "a device that has booted is no default value")]
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]

@@ -3,12 +3,14 @@
 //! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
 //! [`boot`](crate::boot) and [`Rig::stored`].
 
+use std::mem::ManuallyDrop;
 use std::ops::{Deref, DerefMut};
+use std::ptr::NonNull;
 
 use boot_core::bootloader::{
     entries, entry_count, Bootloader, Choices, Config, Everything, Extras, PasswordObject,
 };
-use boot_core::control::{Erase, Policy, Renewal, SealedMemory, Step};
+use boot_core::control::{Erase, Policy, Renewal, Sealed, SealedMemory, Step};
 use boot_core::flash::{run, Flash};
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
@@ -26,7 +28,7 @@ use shared_abi::ram_image::Host;
 use shared_abi::renewal::word;
 use shared_abi::warm_start::BootRequest;
 
-use crate::boot::{leaked, Boot};
+use crate::boot::{takes_sealed, Boot};
 pub use crate::crc::{crc32, Crc};
 use crate::ihex::{record, END_OF_FILE};
 use crate::model::{Chip, ModelFlash, ONE_PROGRAM, TWO_PROGRAMS};
@@ -260,7 +262,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Node for Bootlo
     }
 }
 
-/// The actions of a host.
+/// What a host does with the objects of any bootloader.
 impl dyn Node + '_ {
     /// Runs until there is no work.
     pub fn settle(&mut self) {
@@ -270,6 +272,12 @@ impl dyn Node + '_ {
     /// The same; returns whether the work ended.
     pub fn settles(&mut self) -> bool {
         (0..400_000).any(|_| self.is_idle_after_step())
+    }
+
+    pub fn steps(&mut self, steps: u32) {
+        for _ in 0..steps {
+            self.is_idle_after_step();
+        }
     }
 
     pub fn word(&mut self, index: u16, sub: u8) -> u32 {
@@ -293,17 +301,17 @@ impl dyn Node + '_ {
         self.word(0x1F57, program)
     }
 
-    /// Writes a command to 1F51h without waiting for its result.
+    /// 1F51h, without waiting for the result.
     pub fn command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
         self.write(Address::new(0x1F51, program), &[command])
     }
 
-    /// Ends a download without waiting for its result.
+    /// Ends a download without waiting for the result.
     pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
         self.download_end(Address::new(0x1F50, program))
     }
 
-    /// Ends the transfer like an SDO abort.
+    /// Ends a transfer as an SDO abort does.
     pub fn cancel(&mut self, program: u8) {
         self.download_cancel(Address::new(0x1F50, program));
     }
@@ -344,11 +352,60 @@ pub struct Stored {
     pub node: NodeParameters,
 }
 
+/// A bootloader with the memory that it borrows: a device that makes many resets takes no more than one.
+pub struct Owned {
+    /// It is dropped before its memory.
+    node: ManuallyDrop<Box<dyn Node>>,
+    memory: NonNull<(Vec<u8>, SealedMemory)>,
+}
+
+#[allow(unsafe_code, reason = "a bootloader and what it borrows are kept together")]
+impl Owned {
+    /// The bootloader that `boot` makes with a buffer of this size and, if `is_sealed`, with the memory for sealed
+    /// images.
+    pub fn new(
+        buffer: usize,
+        is_sealed: bool,
+        boot: impl for<'m> FnOnce(&'m mut [u8], Sealed<'m>) -> Box<dyn Node + 'm>,
+    ) -> Self {
+        let mut memory = NonNull::from(Box::leak(Box::new((vec![0; buffer], SealedMemory::default()))));
+        // SAFETY: it was just made, and nothing else refers to it before `drop`.
+        let (buffer, room) = unsafe { memory.as_mut() };
+        let sealed = if is_sealed || takes_sealed() { room.sealed() } else { Sealed::NONE };
+        Self { node: ManuallyDrop::new(boot(buffer, sealed)), memory }
+    }
+}
+
+#[allow(unsafe_code, reason = "a bootloader and what it borrows are kept together")]
+impl Drop for Owned {
+    fn drop(&mut self) {
+        // SAFETY: `node` is not used after this.
+        unsafe { ManuallyDrop::drop(&mut self.node) };
+        // SAFETY: it came from a box, and `node` had the only references to it: `boot`, which is good for any
+        // lifetime, cannot have kept one.
+        drop(unsafe { Box::from_raw(self.memory.as_ptr()) });
+    }
+}
+
+impl Deref for Owned {
+    type Target = dyn Node;
+
+    fn deref(&self) -> &Self::Target {
+        &**self.node
+    }
+}
+
+impl DerefMut for Owned {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        &mut **self.node
+    }
+}
+
 /// A device: its flash, and the bootloader that runs on it.
 pub struct Rig {
     pub setup: &'static Setup,
     pub chip: Chip,
-    pub node: Box<dyn Node>,
+    pub node: Owned,
     buffer: usize,
 }
 
@@ -381,17 +438,8 @@ impl Rig {
         Self { setup, chip, node, buffer }
     }
 
-    fn boot(
-        setup: &'static Setup,
-        chip: &Chip,
-        buffer: usize,
-        request: Option<BootRequest>,
-    ) -> Box<dyn Node> {
+    fn boot(setup: &'static Setup, chip: &Chip, buffer: usize, request: Option<BootRequest>) -> Owned {
         let flash = chip.clone();
-        let (buffer, mut sealed) = leaked(buffer);
-        if setup.takes_sealed {
-            sealed = Box::leak(Box::<SealedMemory>::default()).sealed();
-        }
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let mut boot = Boot::new(&setup.config, node);
@@ -401,14 +449,14 @@ impl Rig {
             let (_, origin, trial_end) = loaded.expect("a bootloader can be loaded");
             boot.report = BootReport { renewal: word(origin, trial_end), ..boot.report };
         }
-        match (setup.programs(), number) {
+        Owned::new(buffer, setup.takes_sealed, |buffer, sealed| match (setup.programs(), number) {
             (1, None) => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, buffer, sealed)),
             (2, None) => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, buffer, sealed)),
             (1, Some(2)) => Box::new(boot.with::<_, _, 2, Renews<2>>(parameters, flash, buffer, sealed)),
             (1, Some(3)) => Box::new(boot.with::<_, _, 2, Renews<3>>(parameters, flash, buffer, sealed)),
             (2, Some(3)) => Box::new(boot.with::<_, _, 3, Renews<3>>(parameters, flash, buffer, sealed)),
             _ => unreachable!(),
-        }
+        })
     }
 
     /// The state that a reset would find now, from a copy of the flash.
@@ -439,12 +487,6 @@ impl Rig {
     pub fn reset_for(&mut self, request: Option<BootRequest>) {
         self.chip.model().power_on();
         self.node = Self::boot(self.setup, &self.chip, self.buffer, request);
-    }
-
-    pub fn steps(&mut self, steps: u32) {
-        for _ in 0..steps {
-            self.node.is_idle_after_step();
-        }
     }
 
     /// CLEAR, which is taken, with all work.
