@@ -505,7 +505,7 @@ fn a_stopped_program_can_be_reset_and_called_back() {
 // --- coflash
 // ---------------------------------------------------------------------------------------------------------
 
-/// The library: the functions of `coflash debug`, in virtual time.
+/// The library: the functions of `coflash more debug`, in virtual time.
 #[test]
 fn the_host_library_sets_breakpoints_and_shows_registers() {
     let mut bench = application();
@@ -574,10 +574,10 @@ fn the_host_library_sets_breakpoints_and_shows_registers() {
     bench.assert_nothing_unmodelled();
 }
 
-/// Runs `coflash debug`; returns exit code, standard output and standard error.
+/// Runs `coflash more debug`; returns exit code, standard output and standard error.
 fn debug(endpoint: &mut Endpoint, words: &[&str]) -> (Option<i32>, String, String) {
     let mut command = tools::coflash();
-    command.arg("debug").args(words).env("COFLASH_BUS", endpoint.url());
+    command.args(["more", "debug"]).args(words).env("COFLASH_BUS", endpoint.url());
     let done = endpoint.run(&mut command);
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (done.status.code(), text(&done.stdout), text(&done.stderr))

@@ -11,8 +11,10 @@ use super::context::Context;
 use super::output::Failure;
 use super::values::milliseconds;
 
-/// Lists the CAN adapters of this computer: serial ports, CAN interfaces of Linux, PEAK and Kvaser
-/// channels, gs_usb devices, and socketcand servers that announce themselves on the network.
+/// Lists the CAN adapters of this computer.
+///
+/// They are serial ports, CAN interfaces of Linux, PEAK and Kvaser channels, gs_usb devices, and
+/// socketcand servers that announce themselves on the network.
 ///
 /// Without --bus the other commands use the only adapter, if there is exactly one. They never
 /// choose a serial port, which may lead to any device, or a server on the network by themselves.
@@ -31,7 +33,7 @@ impl Adapters {
         for (kind, missing) in &list.missing {
             context.out.detail(format_args!("{kind}: {}; {}", missing.what, missing.advice));
         }
-        context.out.result(Table(&list), || value(&list));
+        context.result(Table(&list), || value(&list));
         Ok(())
     }
 }
@@ -86,5 +88,5 @@ pub(super) fn value(list: &List) -> Value {
     let missing = list.missing.iter();
     let missing =
         missing.map(|(kind, why)| json!({ "kind": kind.name(), "what": why.what, "advice": why.advice }));
-    json!({ "command": "adapters", "adapters": adapters, "not_looked_for": missing.collect::<Vec<_>>() })
+    json!({ "adapters": adapters, "not_looked_for": missing.collect::<Vec<_>>() })
 }

@@ -13,8 +13,9 @@ use super::device::cancelled;
 use super::output::{Exit, Failure};
 use super::record;
 
-/// Takes updates for devices from an Eclipse hawkBit server, flashes them, and reports progress and
-/// result of each.
+/// Takes updates from an Eclipse hawkBit server.
+///
+/// It flashes them, and reports progress and result of each.
 ///
 /// It asks the server for each device as often as the server wants, until Ctrl-C ends it. After a
 /// restart it goes on where it was. The tokens come from files or from the environment.
@@ -43,29 +44,26 @@ impl Agent {
         let text = read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         let config = Config::parse(&text, folder, self.hawkbit.as_deref(), context.bus.as_deref());
-        let config = config.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        let config = config.map_err(|fault| Failure::file(path, fault))?;
         let cancelled = cancelled()?;
         // Without random numbers the devices of several agents may ask at the same time.
         let seed = getrandom::u64().unwrap_or_default();
         let options = Options::default().once(self.once).seed(seed).cancelled(cancelled.clone());
-        let tell = |said: &Message| show(context, said);
+        let report = |message: &Message| show(context, message);
         let count = config.targets.len();
         let noun = if count == 1 { "target" } else { "targets" };
         context.out.say(format_args!("{count} {noun}  (Ctrl-C ends it)"));
         let open = |bus: &str| {
             context.link_at(Some(bus), None).map_err(|failure| failure.to_string().trim_end().to_string())
         };
-        let ended = run(&config, &options, &Buses::new(&open, cancelled.clone()), &tell);
+        let ended = run(&config, &options, &Buses::new(&open, cancelled.clone()), &report);
         let ended = ended.map_err(|error| Failure::system(error.to_string()))?;
         let Ended { updated, failed, unserved, .. } = ended;
         let words = format!("{updated} updated, {failed} failed, {unserved} not served");
-        context.out.result(
-            words,
-            || json!({ "command": "agent", "updated": updated, "failed": failed, "unserved": unserved }),
-        );
+        context.result(words, || json!({ "updated": updated, "failed": failed, "unserved": unserved }));
         match failed + unserved {
             // An agent that was ended is not to blame for what happened in its life.
-            bad if bad > 0 && self.once => Err(Failure::told(Exit::Some, legacy::UNKNOWN, bad, count)),
+            bad if bad > 0 && self.once => Err(Failure::several(Exit::Some, legacy::UNKNOWN, bad, count)),
             _ => Ok(()),
         }
     }

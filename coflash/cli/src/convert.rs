@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use ::seal::wire::CERTIFICATE;
 use clap::Args;
 use coflash_core::file::block_file::{self, BlockFile, FRAMING};
 use coflash_core::file::convert::{Converted, Label};
@@ -11,17 +10,18 @@ use coflash_core::file::judge::{judge, StackAtEnd};
 use coflash_core::file::read::Firmware;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
 use coflash_core::file::{Program, Target};
+use seal::wire::CERTIFICATE;
 use serde_json::json;
 
 use super::context::Context;
 use super::file::{warn, Input, Source};
-use super::keys::{self, value_of_128_bits};
 use super::output::Failure;
 use super::output_file;
-use super::seal::{self, Form, ToSeal};
+use super::seal::image::{self, Form, ToSeal};
+use super::seal::keys::{self, value_of_128_bits};
 use super::values::{number, program_number};
 
-/// Converts a firmware file into a block file, ready for 1F50h.
+/// Converts a firmware file into a block file for 1F50h.
 ///
 /// The same input gives the same output, byte for byte; with --ver this also needs --date or
 /// SOURCE_DATE_EPOCH.
@@ -49,7 +49,7 @@ pub(super) struct Convert {
 
     /// Also write the program as it will lie in flash, with filled gaps, to the current folder,
     /// under the name of OUT with .tmp.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     temp: bool,
 
     /// The output's format. There is only one.
@@ -74,16 +74,16 @@ pub(super) struct Labels {
 
     /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31
     /// (0x00640A01 is V1.10r100).
-    #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid")]
+    #[arg(long, value_name = "NUMBER", value_parser = number, requires = "vid", hide_short_help = true)]
     ver: Option<u32>,
 
     /// The date that belongs to --ver or to the image's label, in seconds since 1970. The default
     /// is SOURCE_DATE_EPOCH; without it, that of the file for --ver and no date for the label.
-    #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
+    #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH", hide_short_help = true)]
     date: Option<u64>,
 
     /// Write no identity into block 0, even if the image has a label.
-    #[arg(long, conflicts_with = "vid")]
+    #[arg(long, conflicts_with = "vid", hide_short_help = true)]
     no_label: bool,
 }
 
@@ -96,7 +96,7 @@ struct Encryption {
     ///
     /// The manual names no algorithm: coflash can neither write nor read encrypted files of its
     /// tool. The result is a block file that carries a sealed image (a file named .cbs is the image
-    /// itself), encrypted for the key that `coflash key new --role kek --of-value` makes from the
+    /// itself), encrypted for the key that `coflash seal keys new --role kek --of-value` makes from the
     /// same value.
     #[arg(long, value_name = "HEX128", value_parser = value_of_128_bits, conflicts_with_all = ["crc16", "last_block_2008", "no_label"])]
     key: Option<[u8; 16]>,
@@ -107,7 +107,7 @@ struct Encryption {
     #[arg(long, value_name = "VALUE", value_parser = number, requires = "key")]
     add: Option<u32>,
 
-    /// The private key that signs the encrypted image, as --key of `coflash seal`.
+    /// The private key that signs the encrypted image, as --key of `coflash seal image`.
     #[arg(long, value_name = "FILE", requires = "key")]
     sign: Option<PathBuf>,
 
@@ -206,7 +206,7 @@ impl Convert {
                 release.version
             ));
         }
-        self.tell(context, &output, &done);
+        self.report(context, &output, &done);
         Ok(())
     }
 
@@ -246,12 +246,12 @@ impl Convert {
         if self.encryption.add.is_some_and(|add| add != 0) {
             context.out.warn("--add has no effect: every sealed image has its own nonce");
         }
-        let file = seal::put(output, image, form)?;
-        seal::tell(context, "convert", output, &file, true);
+        let file = image::put(output, image, form)?;
+        image::report(context, output, &file, true);
         Ok(())
     }
 
-    fn tell(&self, context: &Context, output: &Path, done: &Converted) {
+    fn report(&self, context: &Context, output: &Path, done: &Converted) {
         let Converted { program, left_out, .. } = done;
         let (start, size, crc) = (program.start(), program.size(), program.crc());
         let file = BlockFile::of(program);
@@ -266,9 +266,8 @@ impl Convert {
             "{}: {count} blocks, program {size} bytes from {start:#010x} on, CRC {crc:08X}h",
             output.display()
         );
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "convert",
                 "output": output.display().to_string(),
                 "blocks": count,
                 "checksum": file.checksum().to_string(),

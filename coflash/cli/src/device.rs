@@ -49,33 +49,33 @@ pub(super) struct Patience {
     sdo_timeout: Duration,
 
     /// How many times a request that may be repeated is sent if no answer comes.
-    #[arg(long, default_value = "3", value_parser = attempts, value_name = "TIMES")]
+    #[arg(long, default_value = "3", value_parser = attempts, value_name = "TIMES", hide_short_help = true)]
     sdo_attempts: u32,
 
     /// How long a command (such as erase) may take, in milliseconds.
-    #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
+    #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS", hide_short_help = true)]
     command_timeout: Duration,
 
     /// How long a device may send nothing while it executes a command, in milliseconds.
-    #[arg(long, default_value = "10000", value_parser = milliseconds, value_name = "MS")]
+    #[arg(long, default_value = "10000", value_parser = milliseconds, value_name = "MS", hide_short_help = true)]
     silence_timeout: Duration,
 
     /// How long a restart may take, in milliseconds.
-    #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
+    #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS", hide_short_help = true)]
     boot_timeout: Duration,
 
     /// The pause between two status requests to a busy device, in milliseconds; by default 10 at
     /// first and at most 250.
-    #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout")]
+    #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout", hide_short_help = true)]
     delay: Option<Duration>,
 
     /// How many status requests a busy device gets before it is given up, with a pause of --delay
     /// (or a second) between them; replaces --command-timeout.
-    #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout")]
+    #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout", hide_short_help = true)]
     repeats: Option<u32>,
 
     /// Download in segments, even if the device supports block transfer.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     segmented: bool,
 }
 

@@ -54,11 +54,11 @@ pub(super) struct Place {
     start_address: Option<u32>,
 
     /// The last address of the program's region; data above it are left out.
-    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
+    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board", hide_short_help = true)]
     end_address: Option<u32>,
 
     /// The number that is added to every address of the file (0xF8000000 subtracts 0x08000000).
-    #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
+    #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0", hide_short_help = true)]
     adjust_start: u32,
 
     /// The file's format, if the first bytes do not show it.
@@ -74,26 +74,26 @@ pub(super) struct Source {
 
     /// The size of a block in bytes, including its 16 bytes of framing: at most the bootloader's
     /// buffer. The default is 0x400; an update joins them up to 0x1000 where the device takes that.
-    #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number)]
+    #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number, hide_short_help = true)]
     block_size: Option<u32>,
 
     /// The value that fills gaps inside a block: a byte, or a 32-bit pattern.
-    #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
+    #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF", hide_short_help = true)]
     gap_fill: u32,
 
     /// The longest gap inside a block, in bytes; a longer gap starts a new block. The default is
     /// the room in the block.
-    #[arg(long, alias = "block_max_gap", value_name = "BYTES", value_parser = number)]
+    #[arg(long, alias = "block_max_gap", value_name = "BYTES", value_parser = number, hide_short_help = true)]
     block_max_gap: Option<u32>,
 
     /// Protect blocks and program with the 16-bit CRC (polynomial 1021h), for a bootloader that was
     /// built for it.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     crc16: bool,
 
     /// Put 32 reserved bytes into the last block before size and CRC of the program, for a
     /// bootloader of 2008 (manual L-1112e_5).
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     last_block_2008: bool,
 }
 
@@ -253,7 +253,7 @@ impl Place {
 /// The device's other program as it lies in flash: from a firmware file, or from the bytes of the
 /// flash.
 pub(super) fn base(path: &Path) -> Result<Vec<u8>, Failure> {
-    let bytes = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+    let bytes = limit::read(path).map_err(|cause| Failure::file(path, cause))?;
     if bytes.is_empty() {
         return Err(Failure::file(path, "is empty"));
     }

@@ -43,7 +43,7 @@ enum Together {
     Never,
 }
 
-/// Downloads a program into a device, or into many devices, and starts it.
+/// Downloads a program into devices, and starts it.
 ///
 /// The file may be a block file or a sealed image; any other firmware file is converted first. The
 /// tool reads and checks the whole file before it changes a device. An interrupted update can be
@@ -85,7 +85,7 @@ pub(super) struct Flash {
     job: Option<PathBuf>,
 
     /// How many devices are updated at the same time.
-    #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8")]
+    #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8", hide_short_help = true)]
     at_once: u32,
 
     /// Whether devices get the same program together, in one download for all of them.
@@ -93,7 +93,7 @@ pub(super) struct Flash {
     together: Together,
 
     /// Write the results to this file as JSON.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
     report: Option<PathBuf>,
 
     /// The program number: sub-index of 1F50h.
@@ -133,12 +133,12 @@ pub(super) struct Flash {
 
     /// Continue even if another tool talks to the device, or another coflash process of this
     /// computer works on it.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     not_alone: bool,
 
     /// Do not ask a flying NMT master (CiA 302-2) for mastership; by default the tool takes the
     /// mastership during the update of a lift device.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     no_mastership: bool,
 
     /// Leave the device in the bootloader, with the program neither tried nor released for
@@ -152,16 +152,16 @@ pub(super) struct Flash {
     verify: bool,
 
     /// Download a sealed image block by block (--block-size) instead of in one transfer.
-    #[arg(long = "blocks")]
+    #[arg(long = "blocks", hide_short_help = true)]
     in_blocks: bool,
 
     /// Send everything, also if the device could go on with a download of this file that was cut
     /// off.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     from_start: bool,
 
     /// How many times a block is sent again after a CRC error or a broken transfer.
-    #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
+    #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3", hide_short_help = true)]
     block_repeats: u32,
 
     /// Let the device alone judge the image. By default the tool refuses an image that cannot be a
@@ -192,7 +192,7 @@ struct Assignment {
 impl Flash {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         if let Some(list) = self.legacy.list() {
-            context.out.result(&list, || json!({ "command": "flash", "list": list }));
+            context.result(&list, || json!({ "list": list }));
             return Ok(());
         }
         self.legacy.check(context)?;
@@ -344,8 +344,8 @@ impl Flash {
             let row = device.row;
             let dialect = device.dialect.or(self.access.dialect());
             let (image, program) = (row.image.clone(), row.program.unwrap_or(self.number()));
-            let same = known.iter().find(|(path, board, number, its, _)| {
-                (path, board, *number, *its) == (&image, &row.board, program, dialect)
+            let same = known.iter().find(|(path, board, number, dialect_of, _)| {
+                (path, board, *number, *dialect_of) == (&image, &row.board, program, dialect)
             });
             let file = match same {
                 Some((.., file)) => file.clone(),
@@ -484,9 +484,8 @@ impl Flash {
                 outcome.result?
             }
         };
-        context.out.result(report, || {
+        context.result(report, || {
             let mut value = json!(report);
-            value["command"] = "flash".into();
             value["node"] = node.get().into();
             value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
             value

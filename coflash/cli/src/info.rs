@@ -1,14 +1,14 @@
 //! `coflash info`: shows what a device reports about itself.
 
 use clap::Args;
-use coflash_core::device::info::{info, DeviceInfo};
-use serde_json::{json, Value};
+use coflash_core::device::info::info;
+use serde_json::json;
 
 use super::context::Context;
 use super::device::Device;
 use super::output::Failure;
 
-/// Shows what runs on a device, its identity, and the state of its programs.
+/// Shows what runs on a device, its identity and programs.
 #[derive(Debug, Args)]
 pub(super) struct Info {
     #[command(flatten)]
@@ -22,14 +22,7 @@ impl Info {
         let waiting = context.waiting(format!("node {} answers", session.node()));
         let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         drop(waiting);
-        context.out.result(&info, || value(&info));
+        context.result(&info, || json!(info));
         Ok(())
     }
-}
-
-/// The JSON value.
-pub(super) fn value(info: &DeviceInfo) -> Value {
-    let mut value = json!(info);
-    value["command"] = "info".into();
-    value
 }

@@ -9,13 +9,13 @@ use super::context::Context;
 use super::file::{Input, Source};
 use super::output::Failure;
 use super::package::{self, Trusted, Typed};
+use super::seal::verify::{is_sealed, show};
 use super::values::program_number;
-use super::verify::{is_sealed, show};
 
-/// Shows the contents of a firmware file, and checks the whole file.
+/// Shows and checks the contents of a firmware file.
 ///
 /// This checks every record, size and CRC, also those of a block file. Of a sealed image it checks
-/// only the form; verify checks the rest. A package for a machine is checked as before its update.
+/// only the form; coflash seal verify checks the rest. A package for a machine is checked as before its update.
 ///
 /// With --board it also checks that the program fits into its region of that board's flash. This
 /// command needs no device.
@@ -48,7 +48,7 @@ impl Inspect {
             return package::inspect(context, path, &self.trusted);
         }
         if is_sealed(path) {
-            return show(context, "inspect", path);
+            return show(context, path);
         }
         let (firmware, format) = self.source.load(path, self.program)?;
         // Report now what a conversion would refuse. Without a board there is no region for the
@@ -59,7 +59,7 @@ impl Inspect {
             start = Some(done.program.start());
         }
         let inspection = Inspection::of(&firmware, format, start, self.source.layout()?);
-        context.out.result(format_args!("{}: {inspection}", path.display()), || value(&inspection));
+        context.result(format_args!("{}: {inspection}", path.display()), || value(&inspection));
         Ok(())
     }
 }
@@ -94,7 +94,6 @@ fn value(inspection: &Inspection) -> Value {
         })
     });
     json!({
-        "command": "inspect",
         "format": inspection.format.to_string(),
         "bytes": inspection.bytes,
         "segments": inspection.segments.iter().map(segment).collect::<Vec<_>>(),

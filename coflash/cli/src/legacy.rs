@@ -35,12 +35,12 @@ pub(super) struct Legacy {
     /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters
     /// that set the bit rate; ? lists all indices.
     #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = index,
-          overrides_with = "baudrate")]
+          overrides_with = "baudrate", hide_short_help = true)]
     index: Option<Index>,
 
     /// The bit rate in kbit/s, for adapters that set it; with --vxd_type 16 the bit rate of the
     /// serial line in bit/s.
-    #[arg(long, alias = "baurate", value_name = "KBITS", value_parser = number, overrides_with = "index")]
+    #[arg(long, alias = "baurate", value_name = "KBITS", value_parser = number, overrides_with = "index", hide_short_help = true)]
     baudrate: Option<u32>,
 
     /// A value above 0 is --check-target.
@@ -49,23 +49,23 @@ pub(super) struct Legacy {
 
     /// Give the device with this LSS address the node-ID of --node first: the serial number of the
     /// address.
-    #[arg(long = "ser_num", value_name = "NUMBER", value_parser = number)]
+    #[arg(long = "ser_num", value_name = "NUMBER", value_parser = number, hide_short_help = true)]
     serial: Option<u32>,
 
     /// The revision of the LSS address.
-    #[arg(long = "rev", value_name = "NUMBER", value_parser = number)]
+    #[arg(long = "rev", value_name = "NUMBER", value_parser = number, hide_short_help = true)]
     revision: Option<u32>,
 
     /// The product code of the LSS address.
-    #[arg(long = "pcode", value_name = "NUMBER", value_parser = number)]
+    #[arg(long = "pcode", value_name = "NUMBER", value_parser = number, hide_short_help = true)]
     product: Option<u32>,
 
     /// The vendor-ID of the LSS address; by default 0x3F.
-    #[arg(long = "vendor", value_name = "NUMBER", value_parser = number)]
+    #[arg(long = "vendor", value_name = "NUMBER", value_parser = number, hide_short_help = true)]
     vendor: Option<u32>,
 
     /// The PC's CAN interface, by the manual's number: ? lists the numbers with the URL for --bus.
-    #[arg(long = "vxd_type", value_name = "1..16", value_parser = interface)]
+    #[arg(long = "vxd_type", value_name = "1..16", value_parser = interface, hide_short_help = true)]
     vxd_type: Option<Interface>,
 
     #[arg(long = "device_no", value_name = "VALUE", value_parser = number, hide = true)]

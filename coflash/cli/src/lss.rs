@@ -15,8 +15,9 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id, number};
 
-/// Sets node-ID and bit rate over the bus by layer setting services (LSS).
+/// Sets node-ID and bit rate over the bus (LSS).
 ///
+/// These are the layer setting services of CiA 305.
 /// There must be no other LSS master on the bus.
 #[derive(Debug, Args)]
 pub(super) struct Lss {
@@ -38,14 +39,14 @@ enum Service {
     /// Give a device a bit rate.
     BitRate(SetBitRate),
     /// Make a device store its node-ID and bit rate.
-    Store(Store),
+    Store(Selected),
     /// Ask a device for its LSS address and node-ID.
-    Inquire(Inquire),
+    Inquire(Selected),
 }
 
 /// The options that select a device. Without them the command addresses the only device on the bus.
 #[derive(Clone, Copy, Debug, Args)]
-struct Which {
+struct Selected {
     /// Its vendor-ID (1018h/1).
     #[arg(long, value_parser = number, value_name = "NUMBER", requires_all = ["product", "revision", "serial"])]
     vendor: Option<u32>,
@@ -91,7 +92,7 @@ struct Assign {
     reset: bool,
 
     #[command(flatten)]
-    which: Which,
+    device: Selected,
 }
 
 #[derive(Debug, Args)]
@@ -110,22 +111,10 @@ struct SetBitRate {
     store: bool,
 
     #[command(flatten)]
-    which: Which,
+    device: Selected,
 }
 
-#[derive(Debug, Args)]
-struct Store {
-    #[command(flatten)]
-    which: Which,
-}
-
-#[derive(Debug, Args)]
-struct Inquire {
-    #[command(flatten)]
-    which: Which,
-}
-
-impl Which {
+impl Selected {
     /// The address, if the user gave all of it (clap checks "all or nothing").
     fn address(self) -> Option<LssAddress> {
         Some(LssAddress {
@@ -156,13 +145,8 @@ impl Lss {
                 Service::Fastscan(fastscan) => fastscan.run(&mut master, context),
                 Service::Assign(assign) => assign.run(&mut master),
                 Service::BitRate(rate) => rate.run(&mut master),
-                Service::Store(store) => {
-                    store.which.select(&mut master).and_then(|()| master.store()).map(|()| Done {
-                        words: "node-ID and bit rate are stored".to_string(),
-                        ..Done::default()
-                    })
-                }
-                Service::Inquire(inquire) => inquire.run(&mut master),
+                Service::Store(device) => device.store(&mut master),
+                Service::Inquire(device) => device.inquire(&mut master),
             };
             // A device that has switched its bit rate is silent and already in waiting state.
             let back = master.switch_all(false);
@@ -174,11 +158,7 @@ impl Lss {
             adapter.send(&NmtCommand::ResetCommunication.emit(Some(node)))?;
         }
         drop(waiting);
-        context.out.result(done.words, || {
-            let mut value = done.value;
-            value["command"] = "lss".into();
-            value
-        });
+        context.result(done.words, || done.value);
         Ok(())
     }
 
@@ -195,12 +175,6 @@ struct Done {
     value: Value,
     /// The node-ID of the device whose communication must be reset.
     reset: Option<NodeId>,
-}
-
-impl Default for Done {
-    fn default() -> Self {
-        Self { words: String::new(), value: json!({}), reset: None }
-    }
 }
 
 impl Fastscan {
@@ -241,7 +215,7 @@ impl Fastscan {
 
 impl Assign {
     fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
-        self.which.select(master)?;
+        self.device.select(master)?;
         let old = master.inquire_node_id()?;
         master.set_node_id(self.node)?;
         if self.store {
@@ -265,7 +239,7 @@ impl Assign {
 
 impl SetBitRate {
     fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
-        self.which.select(master)?;
+        self.device.select(master)?;
         master.set_bit_rate(self.rate)?;
         if self.store {
             master.store()?;
@@ -288,9 +262,15 @@ impl SetBitRate {
     }
 }
 
-impl Inquire {
-    fn run(&self, master: &mut Master<'_>) -> Result<Done, Error> {
-        self.which.select(master)?;
+impl Selected {
+    fn store(self, master: &mut Master<'_>) -> Result<Done, Error> {
+        self.select(master)?;
+        master.store()?;
+        Ok(Done { words: "node-ID and bit rate are stored".to_string(), value: json!({}), reset: None })
+    }
+
+    fn inquire(self, master: &mut Master<'_>) -> Result<Done, Error> {
+        self.select(master)?;
         let address = master.inquire_address()?;
         let node = master.inquire_node_id()?;
         let words = match node {

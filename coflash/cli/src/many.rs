@@ -159,7 +159,7 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
         None => Ok(()),
         Some(first) => {
             let exit = if outcomes.iter().any(cancelled) { Exit::Cancelled } else { Exit::Some };
-            Err(Failure::told(exit, first.legacy, failed, all))
+            Err(Failure::several(exit, first.legacy, failed, all))
         }
     }
 }

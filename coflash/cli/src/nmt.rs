@@ -16,7 +16,7 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
-/// Starts, stops or resets one node or all nodes by network management (NMT).
+/// Starts, stops or resets one or all nodes (NMT).
 ///
 /// No device answers to NMT. The command therefore reports the heartbeat or the boot-up message
 /// that follows; a device that does not come back after a reset is an error.
@@ -32,7 +32,7 @@ pub(super) struct Nmt {
 
     /// How long to wait for boot-up messages, in milliseconds; the wait for a single device ends
     /// with its message.
-    #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS")]
+    #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS", hide_short_help = true)]
     boot_timeout: Duration,
 }
 
@@ -98,39 +98,39 @@ impl Nmt {
         adapter.send(&self.command.command().emit(node))?;
         // In most networks, heartbeats come once a second.
         let time = if reset { self.boot_timeout } else { LISTEN };
-        let mut told: BTreeMap<NodeId, NmtState> = BTreeMap::new();
+        let mut heard: BTreeMap<NodeId, NmtState> = BTreeMap::new();
         let what = if reset { "a boot-up message comes" } else { "a heartbeat comes" };
         let waiting = context.waiting(what);
         listen(&mut *adapter, time, &cancelled()?, &mut |frame| {
             let Some((from, state)) = parse_state_message(frame) else { return false };
             if node.is_none_or(|node| node == from) && (!reset || state == target) {
-                told.insert(from, state);
+                heard.insert(from, state);
             }
-            node.is_some_and(|node| told.get(&node) == Some(&target))
+            node.is_some_and(|node| heard.get(&node) == Some(&target))
         })?;
         drop(waiting);
-        context.out.result(self.words(node, &told, reset), || {
-            let nodes: Vec<_> = told
+        context.result(self.words(node, &heard, reset), || {
+            let nodes: Vec<_> = heard
                 .iter()
                 .map(|(node, state)| json!({ "node": node.get(), "state": state_words(*state), "confirmed": *state == target }))
                 .collect();
             let name = self.command.to_possible_value().map(|value| value.get_name().to_string());
-            json!({ "command": "nmt", "service": name, "node": node.map(NodeId::get), "heard": nodes })
+            json!({ "service": name, "node": node.map(NodeId::get), "heard": nodes })
         });
         match node {
-            Some(node) if reset && told.is_empty() => Err(Failure::no_boot_up(node)),
+            Some(node) if reset && heard.is_empty() => Err(Failure::no_boot_up(node)),
             _ => Ok(()),
         }
     }
 
-    fn words(&self, node: Option<NodeId>, told: &BTreeMap<NodeId, NmtState>, reset: bool) -> String {
+    fn words(&self, node: Option<NodeId>, heard: &BTreeMap<NodeId, NmtState>, reset: bool) -> String {
         let whom = node.map_or("all nodes".to_string(), |node| format!("node {node}"));
         let one = |(node, state): (&NodeId, &NmtState)| match reset {
             true => format!("node {node}"),
             false if *state == self.command.leads_to() => format!("node {node} is {}", state_words(*state)),
             false => format!("node {node} has not carried out the command and is {}", state_words(*state)),
         };
-        let list = told.iter().map(one).collect::<Vec<_>>().join(", ");
+        let list = heard.iter().map(one).collect::<Vec<_>>().join(", ");
         match (reset, list.is_empty()) {
             (true, true) => format!("{whom}: command sent; no node has sent a boot-up message"),
             (true, false) => format!("back on the bus: {list}"),

@@ -55,7 +55,10 @@ pub(super) fn bytes_of(path: &Path, max: u64) -> Result<Vec<u8>, Failure> {
     let read = std::fs::File::open(path).and_then(|file| file.take(max + 1).read_to_end(&mut bytes));
     read.map_err(|error| Failure::unreadable(path, &error))?;
     if bytes.len() as u64 > max {
-        return Err(Failure::file(path, &format!("it has more than {max} bytes, the limit for this file")));
+        return Err(Failure::file(
+            path,
+            format_args!("it has more than {max} bytes, the limit for this file"),
+        ));
     }
     Ok(bytes)
 }
@@ -66,7 +69,7 @@ impl Names {
         let eds = match &self.eds {
             Some(path) => {
                 let bytes = bytes_of(path, coflash_core::device::eds::MAX as u64)?;
-                Some(Eds::parse(&bytes).map_err(|error| Failure::file(path, &error.to_string()))?)
+                Some(Eds::parse(&bytes).map_err(|error| Failure::file(path, error))?)
             }
             None => None,
         };

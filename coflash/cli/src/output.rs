@@ -22,33 +22,30 @@ use serde_json::{json, Value};
 
 use super::record;
 
-/// The heading of the options that all commands have.
-pub(super) const GLOBAL: &str = "For all commands";
-
 /// The options for the amount and the form of the output, for all commands.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub(super) struct Output {
     /// Write one JSON document to standard output in place of words.
-    #[arg(long, global = true, help_heading = GLOBAL)]
+    #[arg(long, global = true)]
     json: bool,
 
     /// Write events to standard output as they happen, one JSON object on each line: found, phase,
     /// progress, retry, done; then the result, or the error.
-    #[arg(long, global = true, help_heading = GLOBAL, conflicts_with = "json")]
+    #[arg(long, global = true, conflicts_with = "json", hide_short_help = true)]
     json_events: bool,
 
     /// Print nothing unless there is an error.
-    #[arg(long, short, global = true, help_heading = GLOBAL, conflicts_with = "verbose")]
+    #[arg(long, short, global = true, conflicts_with = "verbose", hide_short_help = true)]
     quiet: bool,
 
     /// Print more: what the tool waits for, and what it has chosen by itself.
-    #[arg(long, short, global = true, help_heading = GLOBAL)]
+    #[arg(long, short, global = true, hide_short_help = true)]
     verbose: bool,
 
     /// Exit with the error numbers of the manual's tools (0x60000013 and so on) in place of the
     /// exit codes below; Unix keeps only the last two digits of these numbers.
-    #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_LEGACY_EXIT_CODES",
-          value_parser = clap::builder::FalseyValueParser::new())]
+    #[arg(long, global = true, env = "COFLASH_LEGACY_EXIT_CODES",
+          value_parser = clap::builder::FalseyValueParser::new(), hide_short_help = true)]
     legacy_exit_codes: bool,
 }
 
@@ -201,7 +198,7 @@ impl Output {
     pub(super) fn failure(self, failure: &Failure) {
         record::note("error", failure.to_string().trim_end());
         if self.for_programs() {
-            if !failure.told {
+            if !failure.is_shown {
                 self.document("error", &failure.value());
             }
         } else {
@@ -282,7 +279,7 @@ pub(super) struct Failure {
     /// The device's own answers, in words.
     answers: Vec<String>,
     /// Whether the document on standard output already contains the failure.
-    told: bool,
+    is_shown: bool,
 }
 
 impl Failure {
@@ -305,8 +302,8 @@ impl Failure {
         let failure = Self::from(error);
         match diagnosis.filter(|_| silent) {
             Some(diagnosis) => {
-                let its = Diagnosis { node, ..diagnosis.clone() };
-                Self { advice: Some(its.to_string()), ..failure }
+                let of_node = Diagnosis { node, ..diagnosis.clone() };
+                Self { advice: Some(of_node.to_string()), ..failure }
             }
             None => failure,
         }
@@ -314,9 +311,9 @@ impl Failure {
 
     /// Several devices have failed, and the summary has shown the reasons. `legacy` is the exit
     /// code of the manual's tools, which handle one device, for the first failed device.
-    pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
+    pub(super) fn several(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} devices failed");
-        Self { told: true, legacy, ..Self::new(exit, None, what, None) }
+        Self { is_shown: true, legacy, ..Self::new(exit, None, what, None) }
     }
 
     /// Nothing on the bus is a device that a package is for.
@@ -334,16 +331,16 @@ impl Failure {
             count => format!("node {node} differs from the file in {count} properties"),
         };
         let advice =
-            "flash the file, or find the file that the device was programmed with; coflash events shows \
+            "flash the file, or find the file that the device was programmed with; coflash seal events shows \
                       what was installed";
-        Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
+        Self { is_shown: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
     }
 
     /// A device whose state or option bytes forbid its delivery; each reason was shown.
     pub(super) fn not_ready(node: NodeId) -> Self {
         let advice = "do what each line says, and run the command again".to_string();
         Self {
-            told: true,
+            is_shown: true,
             ..Self::new(Exit::Device, None, format!("node {node} is not ready"), Some(advice))
         }
     }
@@ -352,19 +349,19 @@ impl Failure {
     #[cfg(feature = "conform")]
     pub(super) fn nonconforming(node: NodeId, count: usize) -> Self {
         let what = format!("node {node} has failed {count} of the checks");
-        Self { told: true, ..Self::new(Exit::Device, None, what, None) }
+        Self { is_shown: true, ..Self::new(Exit::Device, None, what, None) }
     }
 
     /// The device refused some of several objects; each refusal was shown. The exit code is that of
     /// the first refusal.
     pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} objects could not be read");
-        Self { told: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
+        Self { is_shown: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
     }
 
     fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
         let legacy = number.unwrap_or(exit.legacy());
-        Self { exit, number, legacy, what, left: None, advice, answers: Vec::new(), told: false }
+        Self { exit, number, legacy, what, left: None, advice, answers: Vec::new(), is_shown: false }
     }
 
     /// An error of the command line's parser.
@@ -425,7 +422,7 @@ impl Failure {
     }
 
     /// A file, other than firmware, with invalid contents.
-    pub(super) fn file(path: &Path, why: &str) -> Self {
+    pub(super) fn file(path: &Path, why: impl fmt::Display) -> Self {
         Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
     }
 
@@ -438,7 +435,7 @@ impl Failure {
     }
 
     /// An error in a line of a file, other than firmware.
-    pub(super) fn line(path: &Path, line: usize, why: &str) -> Self {
+    pub(super) fn line(path: &Path, line: usize, why: impl fmt::Display) -> Self {
         let what = format!("{}, line {line}: {why}", path.display());
         Self::new(Exit::File, None, what, None)
     }
@@ -478,7 +475,7 @@ impl Failure {
     /// A file that is nothing for a device.
     pub(super) fn content(path: &Path, fault: ContentFault) -> Self {
         match fault {
-            ContentFault::Bootloader(fault) => Self::file(path, &format!("it {fault}")),
+            ContentFault::Bootloader(fault) => Self::file(path, format_args!("it {fault}")),
             ContentFault::Sealed(refusal) => Self::sealed(path, &refusal),
             ContentFault::NoProgram { board, program, programs } => {
                 Self::no_such_program(board, program, programs)

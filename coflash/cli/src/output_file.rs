@@ -28,7 +28,7 @@ pub(super) fn spare(path: &Path) -> Result<(), Failure> {
 fn is_secret_key(path: &Path) -> bool {
     let mut front = Vec::new();
     // A pipe would wait for its other end.
-    let is_file = fs::metadata(path).is_ok_and(|told| told.is_file());
+    let is_file = fs::metadata(path).is_ok_and(|about| about.is_file());
     let file = is_file.then(|| fs::File::open(path).ok()).flatten();
     let is_read = file.is_some_and(|file| file.take(LARGEST_KEY).read_to_end(&mut front).is_ok());
     let begins = |line: &str| line.starts_with("-----BEGIN ") && line.contains("KEY-----");

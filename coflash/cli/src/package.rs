@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use canopen::NodeId;
 use clap::parser::ValueSource;
-use clap::{ArgMatches, Args, Command, FromArgMatches};
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
@@ -22,12 +22,14 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::{cancelled, Patience};
-use super::keys::{self, public_key, signing_key};
 use super::many::{write_report, Board};
 use super::output::{Exit, Failure};
 use super::output_file;
+use super::seal::keys::{self, public_key, signing_key};
 
-/// Makes a package for a machine: one file with the programs of several types of nodes.
+/// Makes one file with the programs of a machine.
+///
+/// Such a package has the programs of several types of nodes.
 ///
 /// The recipe says which firmware file is for which nodes, in the order of the update. Each file is
 /// read, checked and converted as by flash. The same input gives the same output, byte for byte.
@@ -61,19 +63,17 @@ impl MakePackage {
         let certificates =
             self.cert.iter().map(|path| keys::certificate(path)).collect::<Result<Vec<_>, _>>()?;
         let of = |certificate: &[u8; CERTIFICATE]| seal::wire::Certificate(certificate).key();
-        let mut rest = certificates.as_slice();
-        while let Some(first) = rest.split_off_first() {
-            if rest.iter().any(|other| of(other) == of(first)) {
-                let advice = "give each key one certificate, and --cert once for it";
-                return Err(Failure::usage("two certificates belong to one key", advice));
-            }
+        let is_second = |(at, one): (usize, &_)| certificates[..at].iter().any(|other| of(other) == of(one));
+        if certificates.iter().enumerate().any(is_second) {
+            let advice = "give each key one certificate, and --cert once for it";
+            return Err(Failure::usage("two certificates belong to one key", advice));
         }
         let pairs: Vec<_> = keys
             .iter()
-            .map(|key| (key, certificates.iter().find(|its| of(its) == key.public().bytes()).copied()))
+            .map(|key| (key, certificates.iter().find(|one| of(one) == key.public().bytes()).copied()))
             .collect();
         let is_used =
-            |certificate: &&[u8; CERTIFICATE]| pairs.iter().any(|(_, its)| its.as_ref() == Some(certificate));
+            |certificate: &&[u8; CERTIFICATE]| pairs.iter().any(|(_, one)| one.as_ref() == Some(certificate));
         if !certificates.iter().all(|certificate| is_used(&certificate)) {
             let advice = "give each certificate with its key";
             return Err(Failure::usage("a certificate belongs to none of the keys", advice));
@@ -90,7 +90,7 @@ impl MakePackage {
         }
         output_file::write(&output, &bytes)?;
         let package = Package::parse(&bytes).map_err(|fault| Failure::package(&output, &fault))?;
-        show(context, "package", &output, &Checked { package, known: None });
+        show(context, &output, &Checked { package, known: None });
         Ok(())
     }
 }
@@ -103,7 +103,7 @@ fn is_same(one: &Path, other: &Path) -> bool {
 
 /// Whether a file is one for a machine.
 pub(super) fn is_package(path: &Path) -> bool {
-    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
+    let is_file = std::fs::metadata(path).is_ok_and(|about| about.is_file());
     let mut front = Vec::new();
     let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
     let is_read = is_file && std::fs::File::open(path).and_then(&mut read).is_ok();
@@ -130,7 +130,7 @@ pub(super) fn read(path: &Path, trusted: &Trusted) -> Result<Checked, Failure> {
 
 /// Shows a package, for `inspect`.
 pub(super) fn inspect(context: &Context, path: &Path, trusted: &Trusted) -> Result<(), Failure> {
-    show(context, "inspect", path, &read(path, trusted)?);
+    show(context, path, &read(path, trusted)?);
     Ok(())
 }
 
@@ -144,7 +144,7 @@ pub(super) struct Trusted {
 }
 
 /// Shows what is in a package.
-fn show(context: &Context, command: &str, path: &Path, checked: &Checked) {
+fn show(context: &Context, path: &Path, checked: &Checked) {
     let Checked { package, known } = checked;
     let manifest = package.manifest();
     let mut words = format!("{}: package for a machine", path.display());
@@ -167,7 +167,7 @@ fn show(context: &Context, command: &str, path: &Path, checked: &Checked) {
     for line in checked.signers() {
         words += &format!("  {line}\n");
     }
-    context.out.result(words, || {
+    context.result(words, || {
         let program = |(entry, program): (&machine::Entry, &coflash_core::update::Payload)| {
             let mut value = json!(entry);
             value["kind"] = kind(program).into();
@@ -177,7 +177,6 @@ fn show(context: &Context, command: &str, path: &Path, checked: &Checked) {
             value
         };
         json!({
-            "command": command,
             "format": "package",
             "output": path.display().to_string(),
             "name": manifest.name,
@@ -215,38 +214,43 @@ impl Checked {
     }
 }
 
-/// The options of `flash` that a package has values for.
-const OF_PACKAGES: [(&str, &str); 30] = [
-    ("node", "--node"),
-    ("node_id", "--node_id"),
-    ("program", "--program"),
-    ("prog_no", "--prog_no"),
-    ("serial", "--ser_num"),
-    ("revision", "--rev"),
-    ("product", "--pcode"),
-    ("vendor", "--vendor"),
-    ("board", "--board"),
-    ("start_address", "--start-address"),
-    ("end_address", "--end-address"),
-    ("adjust_start", "--adjust-start"),
-    ("format", "--input-format"),
-    ("block_size", "--block-size"),
-    ("gap_fill", "--gap-fill"),
-    ("block_max_gap", "--block-max-gap"),
-    ("crc16", "--crc16"),
-    ("last_block_2008", "--last-block-2008"),
-    ("vid", "--vid"),
-    ("pid", "--pid"),
-    ("ver", "--ver"),
-    ("date", "--date"),
-    ("no_label", "--no-label"),
-    ("check_target", "--check-target"),
-    ("chk_tgt", "--chk_tgt"),
-    ("chk_run", "--chk_run"),
-    ("no_trial", "--no-trial"),
-    ("no_start", "--no-start"),
-    ("in_blocks", "--blocks"),
-    ("force", "--force"),
+/// The options of `flash` that do beside a package what they do beside another file. A package has values
+/// for the others.
+const BESIDE_PACKAGES: [&str; 31] = [
+    // What is done, and where it is said.
+    "file",
+    "legacy_file",
+    "job",
+    "report",
+    "at_once",
+    "together",
+    "from_start",
+    "block_repeats",
+    "verify",
+    "watch",
+    "wait",
+    "not_alone",
+    "no_mastership",
+    "dialect",
+    "unlock",
+    // Time limits and transfers.
+    "boot_timeout",
+    "command_timeout",
+    "delay",
+    "repeats",
+    "sdo_attempts",
+    "sdo_timeout",
+    "segmented",
+    "silence_timeout",
+    // The bus; what is ignored or refused for any file is said for a package, too.
+    "baudrate",
+    "index",
+    "vxd_type",
+    "device_no",
+    "ip_addr",
+    "ip_port",
+    "gateway_id",
+    "network_id",
 ];
 
 /// The options for packages alone, and what they would do.
@@ -255,36 +259,40 @@ const FOR_PACKAGES: [(&str, &str); 2] = [
     ("trust", "only the signers of a package are compared with --trust"),
 ];
 
-/// Which options a user has typed: a default, also one of the configuration, contradicts nothing.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Typed {
-    /// The first one that has no meaning beside a package.
-    beside_package: Option<&'static str>,
-    /// What the first one that is for packages alone would do.
-    for_package: Option<&'static str>,
-}
+/// The options that a user has typed: a default, also one of the configuration, contradicts nothing.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Typed(Vec<String>);
 
 impl Typed {
     /// Refuses an option that means nothing for a package, or for any other file.
-    pub(super) fn check(self, is_package: bool) -> Result<(), Failure> {
-        if let Some(what) = self.for_package.filter(|_| !is_package) {
+    pub(super) fn check(&self, is_package: bool) -> Result<(), Failure> {
+        let is_typed = |id: &str| self.0.iter().any(|typed| typed == id);
+        let mut alone = FOR_PACKAGES.iter().filter(|(id, _)| is_typed(id));
+        if let (false, Some((_, what))) = (is_package, alone.next()) {
             let advice = "leave --yes and --trust out, or name a package that coflash package made";
-            return Err(Failure::usage(what, advice));
+            return Err(Failure::usage(*what, advice));
         }
-        let Some(option) = self.beside_package.filter(|_| is_package) else { return Ok(()) };
+        let commands = super::commands();
+        let options = commands.find_subcommand("flash").map(Command::get_arguments).into_iter().flatten();
+        let is_free =
+            |id: &str| BESIDE_PACKAGES.contains(&id) || FOR_PACKAGES.iter().any(|(alone, _)| *alone == id);
+        let refused =
+            |option: &&Arg| is_typed(option.get_id().as_str()) && !is_free(option.get_id().as_str());
+        let option = options.filter(|_| is_package).find(refused).and_then(Arg::get_long);
+        let Some(option) = option else { return Ok(()) };
         let advice = "leave it out: the package says which device gets which program";
-        Err(Failure::usage(format!("{option} has no meaning beside a package"), advice))
+        Err(Failure::usage(format!("--{option} has no meaning beside a package"), advice))
     }
 }
 
 impl FromArgMatches for Typed {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        // A command need not have all of them.
-        let is_typed = |id: &str| {
-            matches.try_contains_id(id).is_ok() && matches.value_source(id) == Some(ValueSource::CommandLine)
+        // Groups have no source.
+        let is_typed = |id: &&clap::Id| {
+            matches.try_contains_id(id.as_str()).is_ok()
+                && matches.value_source(id.as_str()) == Some(ValueSource::CommandLine)
         };
-        let first = |of: &[(&str, &'static str)]| of.iter().find(|(id, _)| is_typed(id)).map(|its| its.1);
-        Ok(Self { beside_package: first(&OF_PACKAGES), for_package: first(&FOR_PACKAGES) })
+        Ok(Self(matches.ids().filter(is_typed).map(ToString::to_string).collect()))
     }
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
@@ -378,7 +386,7 @@ impl Machine {
         let nodes: Vec<NodeId> = plan.nodes().collect();
         let board = Board::new(out, &nodes);
         let show = |node: NodeId, _, event| {
-            if let Some(at) = nodes.iter().position(|its| *its == node) {
+            if let Some(at) = nodes.iter().position(|other| *other == node) {
                 board.show(at, event);
             }
         };
@@ -424,13 +432,13 @@ fn summary(
     out.say("");
     let all = outcomes.len();
     for Outcome { node, entry, result, .. } in outcomes {
-        let Some((its, _)) = package.programs().nth(entry) else { continue };
+        let Some((program, _)) = package.programs().nth(entry) else { continue };
         let whom = node.map_or_else(|| "machine".to_owned(), |node| format!("node {node}"));
         let mut value = json!({
             "node": node.map(NodeId::get),
             "name": whom,
-            "program": its.name,
-            "image": its.file,
+            "program": program.name,
+            "image": program.file,
             "ok": result.is_ok(),
         });
         let device = plan.devices.iter().find(|device| Some(device.node) == node);
@@ -442,12 +450,12 @@ fn summary(
         }
         match result {
             Ok(Good::Had) => {
-                out.say(format_args!("{whom}: {}: it had this program", its.name));
+                out.say(format_args!("{whom}: {}: it had this program", program.name));
                 value["state"] = "had".into();
             }
             Ok(Good::Updated(report)) => {
                 let took = report.took.as_secs_f64();
-                out.say(format_args!("{whom}: {}: done in {took:.1} s", its.name));
+                out.say(format_args!("{whom}: {}: done in {took:.1} s", program.name));
                 value["state"] = "updated".into();
                 value["report"] = json!(report);
             }
@@ -456,7 +464,7 @@ fn summary(
                     Bad::Left(fault) => Failure::of_device(&fault),
                     Bad::Failed(failed) => Failure::from(failed.error).leaving(Some(failed.left)),
                 };
-                out.say(format_args!("{whom}: {}: {}", its.name, failure.to_string().trim_end()));
+                out.say(format_args!("{whom}: {}: {}", program.name, failure.to_string().trim_end()));
                 value["state"] = "failed".into();
                 value["error"] = failure.value()["error"].clone();
                 failures.push(failure);
@@ -483,61 +491,20 @@ fn summary(
     let Some(first) = failures.first() else { return Ok(()) };
     let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
     let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
-    Err(Failure::told(exit, first.legacy, failed, all))
+    Err(Failure::several(exit, first.legacy, failed, all))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The options of `flash` that do beside a package what they do beside another file.
-    const BESIDE_PACKAGES: [&str; 31] = [
-        // What is done, and where it is said.
-        "file",
-        "legacy_file",
-        "job",
-        "report",
-        "at_once",
-        "together",
-        "from_start",
-        "block_repeats",
-        "verify",
-        "watch",
-        "wait",
-        "not_alone",
-        "no_mastership",
-        "dialect",
-        "unlock",
-        // Time limits and transfers.
-        "boot_timeout",
-        "command_timeout",
-        "delay",
-        "repeats",
-        "sdo_attempts",
-        "sdo_timeout",
-        "segmented",
-        "silence_timeout",
-        // The bus; what is ignored or refused for any file is said for a package, too.
-        "baudrate",
-        "index",
-        "vxd_type",
-        "device_no",
-        "ip_addr",
-        "ip_port",
-        "gateway_id",
-        "network_id",
-    ];
-
-    /// A new option of `flash` needs a decision: it has an effect beside a package, or is refused there.
+    /// An option of `flash` that is not in the list is refused beside a package.
     #[test]
-    fn each_option_of_flash_has_an_effect_beside_a_package_or_is_refused() {
+    fn the_options_beside_a_package_are_options_of_flash() {
         let command = super::super::commands();
         let flash = command.find_subcommand("flash").unwrap();
-        let mut all: Vec<&str> = flash.get_arguments().map(|argument| argument.get_id().as_str()).collect();
-        let decided = OF_PACKAGES.iter().chain(&FOR_PACKAGES).map(|(id, _)| *id);
-        let mut decided: Vec<&str> = decided.chain(BESIDE_PACKAGES).collect();
-        all.sort_unstable();
-        decided.sort_unstable();
-        assert_eq!(decided, all);
+        for id in BESIDE_PACKAGES.iter().chain(FOR_PACKAGES.iter().map(|(id, _)| id)) {
+            assert!(flash.get_arguments().any(|argument| argument.get_id() == id), "{id}");
+        }
     }
 }

@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 
 use clap::error::ErrorKind;
+use clap::Command;
 use kit::pages;
 
 use super::commands;
@@ -33,4 +34,41 @@ fn what_the_pages_show_is_understood() {
         assert!(mention || help, "{}: {words:?}: {error}", shown.place);
     }
     assert!(count > 60, "{count}");
+}
+
+/// A message or a comment of the sources that names a command names it with its group.
+#[test]
+fn what_the_sources_name_is_a_command() {
+    fn names(command: &Command) -> Vec<&str> {
+        let below = command.get_subcommands();
+        below.flat_map(|below| [vec![below.get_name()], names(below)].concat()).collect()
+    }
+    let root = commands();
+    let names = names(&root);
+    let house = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
+    let files =
+        std::process::Command::new("git").args(["ls-files", "*.rs"]).current_dir(house).output().unwrap();
+    let mut count = 0;
+    for file in String::from_utf8(files.stdout).unwrap().lines() {
+        // A file may be deleted and not yet committed.
+        let Ok(text) = std::fs::read_to_string(format!("{house}/{file}")) else { continue };
+        // A text may go on in the next line.
+        let text: String = text.split("\\\n").map(str::trim_start).collect();
+        for call in text.split("coflash ").skip(1) {
+            let is_word =
+                |word: &&str| !word.is_empty() && word.bytes().all(|b| b.is_ascii_lowercase() || b == b'-');
+            let line = call.lines().next().unwrap_or_default();
+            let first = line.split(|c: char| !c.is_ascii_lowercase() && c != '-').next().unwrap_or_default();
+            let group = root.find_subcommand(first).filter(|_| ["seal", "more"].contains(&first));
+            let second =
+                line[first.len()..].strip_prefix(' ').and_then(|rest| rest.split([' ', '`', ',']).next());
+            let known = match (group, second.filter(is_word)) {
+                (Some(group), Some(second)) => group.find_subcommand(second).is_some(),
+                _ => root.find_subcommand(first).is_some() || !names.contains(&first),
+            };
+            assert!(known, "{file}: coflash {line}");
+            count += usize::from(names.contains(&first));
+        }
+    }
+    assert!(count > 100, "{count}");
 }

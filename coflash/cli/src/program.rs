@@ -12,9 +12,9 @@ use coflash_core::update::steps::{
 use coflash_core::Error;
 use serde_json::{json, Value};
 
-use super::catch::{self, Limit};
 use super::context::Context;
 use super::device::Program;
+use super::more::catch::{self, Limit};
 use super::output::Failure;
 
 /// Starts the program, and waits until it answers.
@@ -24,13 +24,15 @@ pub(super) struct Start {
     program: Program,
 }
 
-/// Calls the application back to the bootloader, and waits until the bootloader answers.
+/// Calls the application back to the bootloader.
+///
+/// It waits until the bootloader answers.
 #[derive(Debug, Args)]
 pub(super) struct Enter {
     #[command(flatten)]
     program: Program,
 
-    /// Wait for a device that does not answer yet, like coflash catch: the device may still be
+    /// Wait for a device that does not answer yet, like coflash more catch: the device may still be
     /// switched off.
     #[arg(long)]
     wait: bool,
@@ -39,23 +41,27 @@ pub(super) struct Enter {
     limit: Limit,
 }
 
-/// Erases the program. A running application is called back to the bootloader first.
+/// Erases the program.
+///
+/// A running application is called back to the bootloader first.
 #[derive(Debug, Args)]
 pub(super) struct Erase {
     #[command(flatten)]
     program: Program,
 }
 
-/// Releases the program for autostart (83h of 1F51h): on a product on which it does, it
-/// then starts by itself after a reset.
+/// Releases the program for autostart (83h of 1F51h).
+///
+/// On a product on which it does, it then starts by itself after a reset.
 #[derive(Debug, Args)]
 pub(super) struct Release {
     #[command(flatten)]
     program: Program,
 }
 
-/// Withdraws the program's release for autostart: the device then stays in the bootloader after a
-/// reset.
+/// Withdraws the program's release for autostart.
+///
+/// The device then stays in the bootloader after a reset.
 #[derive(Debug, Args)]
 pub(super) struct Withdraw {
     #[command(flatten)]
@@ -76,21 +82,21 @@ pub(super) struct Status {
 /// Carries out a command on one program of one device, and shows the result.
 fn with(
     context: &Context,
-    command: &str,
     program: &Program,
     act: impl FnOnce(&mut Session<'_>, u8, &mut dyn FnMut(Event)) -> Result<(String, Value), Error>,
 ) -> Result<(), Failure> {
     let mut link = context.link()?;
     let mut session = program.device.session(&mut link)?;
-    let _lock =
-        if command == "erase" { Some(context.lock(context.bus.as_deref(), session.node())?) } else { None };
-    let waiting = context.waiting(format!("node {} has carried out the command ({command})", session.node()));
+    let erases = context.command == "erase";
+    let _lock = erases.then(|| context.lock(context.bus.as_deref(), session.node())).transpose()?;
+    let waiting =
+        context.waiting(format!("node {} has carried out the command ({})", session.node(), context.command));
     let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
         .map_err(|error| Failure::diagnosed(error, &mut session))?;
     drop(waiting);
     let node = session.node();
-    context.out.result(format_args!("node {node}: {words}"), || {
-        let mut value = json!({ "command": command, "node": node.get(), "program": program.program });
+    context.result(format_args!("node {node}: {words}"), || {
+        let mut value = json!({ "node": node.get(), "program": program.program });
         if let (Some(value), Value::Object(more)) = (value.as_object_mut(), more) {
             value.extend(more);
         }
@@ -101,16 +107,16 @@ fn with(
 
 impl Start {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "start", &self.program, |session, number, tell| {
+        with(context, &self.program, |session, number, report| {
             let running = session.find()?;
-            tell(Event::Found(running));
+            report(Event::Found(running));
             if !running.is_bootloader() {
                 if runs(session, number)? {
                     return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
                 }
-                tell(Phase::CallingBack.into());
+                report(Phase::CallingBack.into());
                 call_back(session)?;
-                tell(Phase::InBootloader.into());
+                report(Phase::InBootloader.into());
             }
             let running = start(session, number)?;
             Ok((format!("{running} is running"), json!({ "running": running.0 })))
@@ -121,11 +127,11 @@ impl Start {
 impl Enter {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         if self.wait || self.limit.is_set() {
-            return catch::run(context, "enter", &self.program.device, &self.limit, false);
+            return catch::run(context, &self.program.device, &self.limit, false);
         }
-        with(context, "enter", &self.program, |session, _, tell| {
+        with(context, &self.program, |session, _, report| {
             let running = session.find()?;
-            tell(Event::Found(running));
+            report(Event::Found(running));
             let words = if running.is_bootloader() {
                 "the bootloader is running already"
             } else {
@@ -139,9 +145,9 @@ impl Enter {
 
 impl Erase {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "erase", &self.program, |session, number, tell| {
+        with(context, &self.program, |session, number, report| {
             session.ensure_alone()?;
-            enter_bootloader(session, tell)?;
+            enter_bootloader(session, report)?;
             let began = session.now();
             erase_at_once(session, number)?;
             let seconds = session.now().saturating_sub(began).as_secs_f64();
@@ -152,11 +158,11 @@ impl Erase {
 
 impl Release {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "release", &self.program, |session, number, tell| {
+        with(context, &self.program, |session, number, report| {
             // Report an absent device at once; the wait below is for a device that does not answer
             // the command.
-            tell(Event::Found(session.find()?));
-            release(session, number, tell)?;
+            report(Event::Found(session.find()?));
+            release(session, number, report)?;
             Ok((format!("program {number} is released for autostart"), json!({})))
         })
     }
@@ -164,8 +170,8 @@ impl Release {
 
 impl Withdraw {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "withdraw", &self.program, |session, number, tell| {
-            tell(Event::Found(session.find()?));
+        with(context, &self.program, |session, number, report| {
+            report(Event::Found(session.find()?));
             withdraw(session, number)?;
             let words =
                 format!("program {number} is no longer released for autostart: it does not start by itself");
@@ -176,9 +182,9 @@ impl Withdraw {
 
 impl Status {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, "status", &self.program, |session, number, tell| {
+        with(context, &self.program, |session, number, report| {
             let running = session.find()?;
-            tell(Event::Found(running));
+            report(Event::Found(running));
             if self.clear {
                 reset_status(session, number)?;
             }

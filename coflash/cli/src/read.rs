@@ -15,13 +15,13 @@ use super::objects::{self, Names, Object};
 use super::output::{Exit, Failure};
 use super::output_file;
 
-/// Reads objects, or a program if the device allows it (1F50/1).
+/// Reads objects; a program if the device allows it.
 ///
 /// An object is a hexadecimal index and, after a slash, a decimal sub-index: 1018/4, or 100A for
 /// sub-index 0. 1018/1..4 is a range of sub-indices. With --eds an object may be named: "Program
 /// control/1". If the device refuses one object, the others are still read.
 ///
-/// With --unlock the tool calls a lift device into its bootloader, unlocks it and restarts it
+/// 1F50/1 is a program. With --unlock the tool calls a lift device into its bootloader, unlocks it and restarts it
 /// afterwards, so that you can save its program (1F50/1) and its parameter set (1F50/2).
 #[derive(Debug, Args)]
 pub(super) struct Read {
@@ -97,11 +97,10 @@ impl Read {
         }
         match values.as_mut_slice() {
             [value] if objects.len() == 1 => {
-                value["command"] = "read".into();
                 value["node"] = node.into();
-                context.out.value(value);
+                context.value(std::mem::take(value));
             }
-            values => context.out.value(&json!({ "command": "read", "node": node, "objects": values })),
+            values => context.value(json!({ "node": node, "objects": values })),
         }
         match refused {
             None => Ok(()),

@@ -18,6 +18,7 @@ use coboot_can::{wall, Adapter, Tap};
 use coflash_core::update::{stamp, Event, Histories};
 use serde_json::{json, Value};
 
+use super::context::Context;
 use super::secrets;
 
 /// The files of a run's folder: the report, the events, the messages, the frames.
@@ -74,28 +75,23 @@ fn cannot(path: &Path, error: &io::Error) -> String {
     format!("{}: cannot be written: {error}", path.display())
 }
 
-/// Starts the records that the command line asks for. `command` is the command's name, for the name
-/// of the folder.
-pub(super) fn begin(
-    log: Option<&Path>,
-    reports: Option<&Path>,
-    command: &str,
-    words: &[OsString],
-    password: Option<&str>,
-    bus: Option<&str>,
-) -> Result<(), String> {
-    let mut logs: Vec<Sink> = log.map(Sink::new).transpose()?.into_iter().collect();
-    let report = match reports {
+/// Starts the records that the command line asks for.
+pub(super) fn begin(context: &Context, words: &[OsString], password: Option<&str>) -> Result<(), String> {
+    let mut logs = Vec::new();
+    if let Some(log) = &context.log_file {
+        logs.push(Sink::new(log)?);
+    }
+    let report = match &context.report_dir {
         Some(folder) => {
-            let folder = own_folder(folder, command)?;
+            let folder = own_folder(folder, &context.command.replace(' ', "-"))?;
             let [_, events, messages, frames] = FILES.map(|file| folder.join(file));
             logs.push(Sink::new(&messages)?);
             let document = json!({
                 "coflash": env!("COFLASH_VERSION"),
                 "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
-                "command": command,
+                "command": context.command,
                 "command_line": secrets::without(words, password),
-                "bus": bus,
+                "bus": context.bus,
                 "began": stamp(wall()),
                 "ended": null,
             });

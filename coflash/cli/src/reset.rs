@@ -13,7 +13,7 @@ use super::device::cancelled;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
-/// Resets one device or all devices, and shows which ones come back.
+/// Resets one or all devices, and shows which come back.
 ///
 /// After a reset a device starts its program if the program is released for autostart and the
 /// device's autostart is enabled.
@@ -32,7 +32,7 @@ pub(super) struct Reset {
     communication: bool,
 
     /// How long to wait for boot-up messages, in milliseconds.
-    #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS")]
+    #[arg(long, default_value = "2000", value_parser = milliseconds, value_name = "MS", hide_short_help = true)]
     boot_timeout: Duration,
 }
 
@@ -63,9 +63,9 @@ impl Reset {
                 format!("back on the bus: node {}", nodes.join(", "))
             }
         };
-        context.out.result(words, || {
+        context.result(words, || {
             let back: Vec<u8> = back.iter().map(|node| node.get()).collect();
-            json!({ "command": "reset", "node": node.map(NodeId::get), "booted": back })
+            json!({ "node": node.map(NodeId::get), "booted": back })
         });
         match node {
             Some(node) if back.is_empty() => Err(Failure::no_boot_up(node)),

@@ -14,7 +14,6 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::cancelled;
-use super::info;
 use super::output::Failure;
 use super::values::{milliseconds, nodes};
 
@@ -60,7 +59,7 @@ impl Scan {
             false => None,
         };
         let table = Table { found: &found, advice: advice.as_deref() };
-        context.out.result(table, || json!({ "command": "scan", "nodes": values(&found), "advice": advice }));
+        context.result(table, || json!({ "nodes": values(&found), "advice": advice }));
         Ok(())
     }
 }
@@ -107,7 +106,7 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
         return [node, runs, none(), none(), none(), none(), state];
     };
     let who = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
-    let is_sealed = info.security.as_ref().is_some_and(|told| told.sealed);
+    let is_sealed = info.security.as_ref().is_some_and(|security| security.sealed);
     let runs = if is_sealed { format!("{who}, sealed") } else { who.to_string() };
     let text = |text: &Option<String>| text.clone().unwrap_or_else(none);
     let serial = info.identity[3].map_or_else(none, |serial| format!("{serial:08X}h"));
@@ -145,7 +144,7 @@ fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {
             "state": found.state.map(state_words),
             "answers": found.info.is_some() || found.but.is_some(),
             "but": found.but,
-            "info": found.info.as_ref().map(info::value),
+            "info": found.info,
         })
     };
     found.iter().map(value).collect()

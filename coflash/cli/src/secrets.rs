@@ -89,7 +89,10 @@ mod tests {
             ("coflash flash a --unlock sesame -N 5", "coflash flash a --unlock *** -N 5"),
             ("coflash flash a --unlock=sesame", "coflash flash a --unlock=***"),
             ("coflash convert a --key 1234 --add 1", "coflash convert a --key *** --add 1"),
-            ("coflash key new --role kek --of-value 12", "coflash key new --role kek --of-value ***"),
+            (
+                "coflash seal keys new --role kek --of-value 12",
+                "coflash seal keys new --role kek --of-value ***",
+            ),
             ("coflash write 6005/1 Sesam --type string", "coflash write 6005/1 *** --type string"),
             ("coflash write 6005/1 --type string Sesam", "coflash write 6005/1 --type string ***"),
             ("coflash flash a --unlock", "coflash flash a --unlock"),

@@ -15,7 +15,9 @@ use super::output::Failure;
 use super::package::{self, Trusted, Typed};
 use super::record;
 
-/// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
+/// Serves a page for the browser, to this computer only.
+///
+/// The page has scan, update, LSS and the bus in words.
 ///
 /// With --service the page is for people who update machines: it takes this one package or job file, has nothing
 /// else to choose, and saves a report about each device in the folder of --report-dir; without it, in
@@ -58,10 +60,7 @@ impl Ui {
         options.port = self.port;
         options.kinds = context.kinds();
         options.failed = Failed::new(|update| record::failed(update, &[]));
-        options.sdo_ids = match (context.sdo_request, context.sdo_response) {
-            (None, None) => None,
-            (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),
-        };
+        options.sdo_ids = context.sdo_ids();
         self.typed.check(self.service.is_some())?;
         if let Some(path) = &self.service {
             options.service = Some(self.station(context, path)?);
@@ -70,9 +69,7 @@ impl Ui {
             Failure::system(format!("port {} of 127.0.0.1 cannot be served: {error}", self.port))
         })?;
         let url = server.url();
-        context
-            .out
-            .result(format_args!("{url}  (Ctrl-C ends it)"), || json!({ "command": "ui", "url": url }));
+        context.result(format_args!("{url}  (Ctrl-C ends it)"), || json!({ "url": url }));
         if !self.no_open && open::that_detached(&url).is_err() {
             context.out.warn("no browser was found: open the URL yourself");
         }

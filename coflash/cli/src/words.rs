@@ -2,8 +2,12 @@
 //! before the command.
 
 use std::ffi::OsString;
+use std::iter::successors;
 
-use clap::{Arg, Command};
+use clap::error::{ContextKind, ContextValue};
+use clap::{Arg, ArgMatches, Command};
+
+use super::secrets;
 
 /// A word as the parser expects it. The manual prints the dash of `–F` and `–I` as an en dash, and
 /// so does a command line that was copied from it.
@@ -81,6 +85,51 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     kept
 }
 
+/// The names of the command and its subcommands, with a blank between them.
+pub fn path(matches: &ArgMatches) -> String {
+    let below = successors(matches.subcommand(), |(_, below)| below.subcommand());
+    below.map(|(name, _)| name).collect::<Vec<_>>().join(" ")
+}
+
+/// Adds the full command to an error about an unknown one, where a group has a command of this name.
+/// A plural s makes no difference.
+pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) -> clap::Error {
+    let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else { return error };
+    let words = secrets::without(words, None);
+    let Some(at) = words.iter().position(|word| word == name) else { return error };
+    let is_same = |below: &Command| below.get_name().trim_end_matches('s') == name.trim_end_matches('s');
+    let mut level = vec![(String::new(), root)];
+    let mut found: Vec<String> = Vec::new();
+    while found.is_empty() && !level.is_empty() {
+        let mut next = Vec::new();
+        for (path, command) in level {
+            let below = command.get_subcommands();
+            next.extend(below.map(|below| (format!("{path} {}", below.get_name()), below)));
+        }
+        found.extend(next.iter().filter(|(_, below)| is_same(below)).map(|(path, _)| path.clone()));
+        level = next;
+    }
+    if found.is_empty() {
+        return error;
+    }
+    // Options may come before the command, and so may the name of another group.
+    let mut group = root;
+    let before = words[1..at].iter().filter(|word| match group.find_subcommand(word) {
+        Some(below) => {
+            group = below;
+            false
+        }
+        None => true,
+    });
+    let before: String = before.map(|word| format!(" {word}")).collect();
+    let after: String = words[at + 1..].iter().map(|word| format!(" {word}")).collect();
+    let tips = found.iter().map(|path| format!("the command is 'coflash{before}{path}{after}'").into());
+    let tips = ContextValue::StyledStrs(tips.collect());
+    error.remove(ContextKind::SuggestedSubcommand);
+    error.insert(ContextKind::Suggested, tips);
+    error
+}
+
 /// The first command or subcommand that has this option.
 fn within<'c>(command: &'c Command, name: &Name<'_>) -> Option<&'c Arg> {
     let own = command.get_arguments().find(|argument| name.is_of(argument));
@@ -156,8 +205,37 @@ mod tests {
         }
     }
 
+    /// A command that has moved into a group is named with its new words: none is in a list.
     #[test]
-    fn an_option_in_front_of_its_command_goes_behind_it() {
+    fn a_command_of_a_group_is_named_in_full() {
+        for (line, commands) in [
+            ("release -N 5", &["more release -N 5"][..]),
+            ("--bus x --json verify a.cbs --root r.pub", &["--bus x --json seal verify a.cbs --root r.pub"]),
+            ("key new --role root", &["seal keys new --role root"]),
+            ("keys new --of-value 12", &["seal keys new --of-value ***"]),
+            ("verify-device a.cbs", &["seal verify-device a.cbs"]),
+            ("--json more verify a.cbs", &["--json seal verify a.cbs"]),
+            ("seal flash a", &["flash a"]),
+            ("fastscan", &["lss fastscan"]),
+            ("step", &["more debug step"]),
+            ("show a.cbs", &["seal show a.cbs"]),
+            ("flsh a", &[]),
+        ] {
+            let words = || std::iter::once("coflash").chain(line.split(' ')).map(OsString::from).collect();
+            let words: Vec<OsString> = ordered(words(), &super::super::commands());
+            let error = super::super::commands().try_get_matches_from(&words).unwrap_err();
+            let error = with_paths(error, &words, &super::super::commands());
+            let tip = |text: &str| {
+                Some(text.split_once("tip: the command is 'coflash ")?.1.trim_end_matches('\'').to_owned())
+            };
+            let tips: Vec<String> = error.to_string().lines().filter_map(tip).collect();
+            assert_eq!(tips, commands, "{line}: {error}");
+            assert_eq!((error.kind(), error.exit_code()), (clap::error::ErrorKind::InvalidSubcommand, 2));
+        }
+    }
+
+    #[test]
+    fn an_option_before_its_command_goes_after_it() {
         for (words, ordered) in [
             ("--node 5 info", "info --node 5"),
             ("-N 5 --json flash a.elf --verify", "--json flash -N 5 a.elf --verify"),
@@ -166,7 +244,7 @@ mod tests {
             ("--node 5 --verify --bus x flash a.elf", "--bus x flash --node 5 --verify a.elf"),
             ("--sdo_timeout 70 info", "info --sdo_timeout 70"),
             ("--node 5 lss assign --store", "lss assign --node 5 --store"),
-            ("--node 5 debug read 0x20000000", "debug --node 5 read 0x20000000"),
+            ("--node 5 more debug read 0x20000000", "more debug --node 5 read 0x20000000"),
             ("-q -N 1,5-7 flash a", "-q flash -N 1,5-7 a"),
         ] {
             assert_eq!(line(words), ordered, "{words}");

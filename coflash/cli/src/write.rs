@@ -66,9 +66,8 @@ impl Write {
         drop(waiting);
         let node = session.node();
         let (size, plural) = (bytes.len(), if bytes.len() == 1 { "" } else { "s" });
-        context.out.result(format_args!("node {node}, {object}: written, {size} byte{plural}"), || {
+        context.result(format_args!("node {node}, {object}: written, {size} byte{plural}"), || {
             let mut value = object.value();
-            value["command"] = "write".into();
             value["node"] = node.get().into();
             value["size"] = size.into();
             value

@@ -7,7 +7,7 @@ use super::check::{Outcome, Verdict};
 pub fn junit(verdicts: &[Verdict]) -> String {
     let count = |which: fn(&Outcome) -> bool| verdicts.iter().filter(|v| which(&v.outcome)).count();
     let mut text = format!(
-        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuite name=\"coflash conform\" tests=\"{}\" failures=\"{}\" skipped=\"{}\">\n",
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuite name=\"coflash more conform\" tests=\"{}\" failures=\"{}\" skipped=\"{}\">\n",
         verdicts.len(),
         count(|outcome| matches!(outcome, Outcome::Failed(_))),
         count(|outcome| matches!(outcome, Outcome::Skipped(_))),

@@ -1,4 +1,4 @@
-//! Conformance checks for a device on a real bus (`coflash conform`).
+//! Conformance checks for a device on a real bus (`coflash more conform`).
 //!
 //! A check is data (its number, the clause, what is expected) and a function over a bench. Those
 //! that reset the device ([`Check::resets`]) or install a program ([`Check::installs`]) say so; the

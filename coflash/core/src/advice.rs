@@ -185,7 +185,7 @@ advice! {
         switched off and on[; for a product with a longer time give that time and 15 s more, in ms, as \
         --boot-timeout|]",
     /// For a device that takes sealed images alone.
-    Seal => "seal the program with a key that a root of the device has certified[ (coflash seal)|], and \
+    Seal => "seal the program with a key that a root of the device has certified[ (coflash seal image)|], and \
         [flash|choose] the sealed image",
     /// For a program that is linked for another address.
     OtherRegion => "link the program for that address, or check [--program and --board; --force leaves that \
@@ -201,7 +201,7 @@ advice! {
         command again with --node {other}|search the bus, and choose node {other}]",
     /// For an application that refuses to leave in its present state.
     RefusesNow { node: NodeId } => "the application refuses now: stop the machine and [run the command|try] \
-        again. If it refuses for ever, [run coflash catch --node {node} and |]switch the device off and on[| \
+        again. If it refuses for ever, [run coflash more catch --node {node} and |]switch the device off and on[| \
         and try again at once]: after a refusal the next start has a rescue window[ (with a sealed program \
         after coflash reset --node {node} alone)|]; the entry strap helps, too",
     /// For an application that does not know the call.
@@ -213,7 +213,7 @@ advice! {
         strap, or within its rescue window after power-on",
     /// For a device that does not come back as bootloader.
     Catch => "switch the device off and on and [run the command again; if its application ignores the call, \
-        coflash catch holds the device in the bootloader while it is switched off and on (rescue window), \
+        coflash more catch holds the device in the bootloader while it is switched off and on (rescue window), \
         and so does the entry strap|try again at once; its entry strap holds it in the bootloader, too]",
     /// For a search by LSS that ends without an answer.
     FastscanAgain => "run it again; if it happens again, two devices may have one LSS address",
@@ -244,21 +244,21 @@ advice! {
         run first]",
     /// For a program on trial that does not answer.
     TrialSilent { node: NodeId } => "switch the device off and on: it comes up in the bootloader, ready for \
-        another program[ (coflash catch --node {node} waits for it)|]; the program may crash or have a wrong \
+        another program[ (coflash more catch --node {node} waits for it)|]; the program may crash or have a wrong \
         bit rate; [for one that answers under another node-ID than its bootloader there is --no-trial|one \
         that answers under another node-ID than its bootloader is updated without Trial run first]",
     /// For a program on trial that does not return.
     GiveWayBack { node: NodeId } => "give the program 1F51h = 80h, the way back into the bootloader \
         (docs/application.md): without it the device can never be updated over the bus. [Reset the device \
         (coflash reset --node {node}), or switch it|Switch the device] off and on: it comes up in the \
-        bootloader, ready for another program[ (coflash catch --node {node} waits for it)|]",
+        bootloader, ready for another program[ (coflash more catch --node {node} waits for it)|]",
     /// For a program that may have come up as another node.
     ProgramElsewhere { other: NodeId } => "if node {other} is this device ([coflash info --node {other}|More \
         … in its row]), its program has another node-ID than its bootloader: let it take that of the handoff \
         (docs/application.md)",
     /// For a program that does not answer after its start.
     ProgramSilent { node: NodeId } => "the program may not speak CANopen, use another node-ID or bit rate, \
-        or crash: [run coflash catch --node {node}, |]switch the device off and on, and [flash another one; \
+        or crash: [run coflash more catch --node {node}, |]switch the device off and on, and [flash another one; \
         if it is not caught|update it with another one at once; if that does not succeed], use its entry \
         strap",
     /// For a device without a program.
@@ -317,26 +317,26 @@ advice! {
         identity|More … at the device shows its identity])",
     /// For 1F57h: no access.
     NoAccess => "the device forbids this at present. If it is sealed ([coflash info|More … at the device] \
-        says so), it takes sealed images alone[ (coflash seal)|], and other changes only with a right, which \
-        the signature of a root gives[ (coflash unlock)|]; otherwise ask its manufacturer what allows it",
+        says so), it takes sealed images alone[ (coflash seal image)|], and other changes only with a right, which \
+        the signature of a root gives[ (coflash seal unlock)|]; otherwise ask its manufacturer what allows it",
     /// For 1F57h: busy.
     WaitABit => "wait a moment and [run the command|try] again; another tool may be at work on the device",
     /// For 1F57h: a signature.
-    BadSignature => "check the file with [coflash verify and |]the root's public key; seal the program again \
+    BadSignature => "check the file with [coflash seal verify and |]the root's public key; seal the program again \
         with a key that the device's root has certified",
     /// For 1F57h: an old image.
-    Rollback => "compare counter and epoch in [coflash show|Contents of the file] with those that the device \
+    Rollback => "compare counter and epoch in [coflash seal show|Contents of the file] with those that the device \
         takes, in [coflash info|More … at the device]: an old program is sealed again with a higher \
         [--counter|counter], and in place of an old key sign with the one that is valid now",
     /// For 1F57h: a key.
-    OtherKey => "compare the key ids [that coflash show tells|in Contents of the file] with those that the \
+    OtherKey => "compare the key ids [that coflash seal show prints|in Contents of the file] with those that the \
         device was provisioned with; programs that are signed for tests run on devices for tests alone",
     /// For 1F57h: the sequence.
     Sequence => "[run the command|try] again; another tool may be at work on the device",
     /// For any other value of 1F57h.
     OnceMore => "[run the command|try] again, or switch the device off and on first",
     /// For a sealed image and a device without keys.
-    Provision => "write keys into the device with a debug probe[ (coflash provision makes the file)|], or \
+    Provision => "write keys into the device with a debug probe[ (coflash seal provision makes the file)|], or \
         [flash|choose] the program as it is, not sealed",
     /// For a sealed image that cannot be cut into blocks.
     OneDownload => "[send it in one download: leave out --blocks|the device takes this sealed image in one \
@@ -389,7 +389,7 @@ advice! {
     AreaExternal => "the bootloader writes the chip's own flash alone: leave the section out of the file[ \
         (objcopy --remove-section)|], and let the program or a debug probe write it",
     /// For a file that is no sealed image.
-    GiveSealed => "[give a file that `coflash seal` made|choose a sealed image]",
+    GiveSealed => "[give a file that `coflash seal image` made|choose a sealed image]",
     /// For a sealed image that is damaged.
     CopyAgain => "copy the file again from where it was sealed, or seal the program again",
     /// For a sealed image of another format.
@@ -408,14 +408,14 @@ advice! {
     /// For a key of an old epoch.
     RevokedKey => "the key was revoked by a higher epoch: sign with the key that is valid now",
     /// For a certificate that does not cover the program.
-    Certify => "have the key certified for this program[: `coflash key certify`|]",
+    Certify => "have the key certified for this program[: `coflash seal keys certify`|]",
     /// For a root that is not given.
-    GiveRoot => "[give the public key of the root that certified it (--root); `coflash show` shows its \
+    GiveRoot => "[give the public key of the root that certified it (--root); `coflash seal show` shows its \
         id|seal it with a certificate of a root that the device has]",
     /// For a test key.
     ReleaseKey => "sign it with a release key[, or check it for a device for tests (--for-tests)|]",
     /// For a key-encryption key that is not given.
-    GiveKek => "[give one of the keys that it is encrypted for (--kek); `coflash show` shows their \
+    GiveKek => "[give one of the keys that it is encrypted for (--kek); `coflash seal show` shows their \
         ids|encrypt it for a key of the device]",
     /// For a certificate of a stranger.
     UnknownCertificate => "do not use this file: the origin of its certificate is unknown",
@@ -429,7 +429,7 @@ advice! {
     /// For a raw binary among other files.
     RawNeedsAddress => "[for a raw binary give -I binary and --start-address|a raw binary needs a board]",
     /// For a sealed image in the place of a program.
-    SealedStays => "[`coflash flash` downloads it, `coflash show` and `coflash verify` describe it|choose it \
+    SealedStays => "[`coflash flash` downloads it, `coflash seal show` and `coflash seal verify` describe it|choose it \
         without a change]",
     /// For a raw binary without an address.
     GiveAddress => "[give --start-address or --board|choose the board]",
@@ -443,7 +443,7 @@ advice! {
     /// For a file that is no program.
     IsRefused => "[coflash flash|an update] refuses it",
     /// For a program that is left unreleased.
-    ReleaseIt => "[coflash start tries the program, coflash release releases it|More … at the device has \
+    ReleaseIt => "[coflash start tries the program, coflash more release releases it|More … at the device has \
         Start the program, which tries it, and Release for autostart]",
     /// For a program that waits after a call.
     StartIt => "[coflash start|Start the program, in More … at the device,] starts it again",

@@ -1,7 +1,7 @@
 //! The key block, which makes a device a sealed device.
 //!
 //! It occupies the last 256 bytes of the bootloader's flash region. Production writes it together
-//! with the bootloader (`coflash provision`), and it never changes in the field. The code reads it
+//! with the bootloader (`coflash seal provision`), and it never changes in the field. The code reads it
 //! in place and never copies all of it to RAM.
 //!
 //! | offset | bytes | |

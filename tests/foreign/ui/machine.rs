@@ -154,7 +154,7 @@ fn all_but(absent: Option<u8>, state: &str) -> Vec<(u64, String)> {
 #[test]
 fn a_sealed_device_programs_in_c_and_in_rust_are_updated_by_command_line_page_and_agent() {
     let mut machine = Machine::new();
-    machine.done(&["key", "new", "--role", "root", "-o", "root.pem"]);
+    machine.done(&["seal", "keys", "new", "--role", "root", "-o", "root.pem"]);
     machine.package(&OLD);
     machine.package(&NEW);
 

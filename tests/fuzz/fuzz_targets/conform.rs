@@ -1,4 +1,4 @@
-//! The checks of `coflash conform` against a device that answers as it likes: its answers are
+//! The checks of `coflash more conform` against a device that answers as it likes: its answers are
 //! changed, lost, late and doubled, and foreign frames come at any time, for ever if it likes.
 //!
 //! Must hold: the checks end, within a bounded time on the clock of the bus and a bounded number of

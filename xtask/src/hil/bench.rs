@@ -41,7 +41,7 @@ pub struct Bench {
     pub probe: CommandLine,
     /// The commands, in the order of [`HANDS`].
     pub hands: [Option<CommandLine>; 4],
-    /// The line of --power-command, for `coflash conform`.
+    /// The line of --power-command, for `coflash more conform`.
     pub power_line: Option<String>,
     pub coflash: Coflash,
     /// The bootloader, and the folder of the board's other images.
@@ -51,7 +51,7 @@ pub struct Bench {
     pub work: PathBuf,
     /// The CRC of the last program that went into the device to its end, as text.
     pub installed: Option<String>,
-    /// The documents that `coflash conform` wrote.
+    /// The documents that `coflash more conform` wrote.
     pub conform: Vec<Value>,
 }
 

@@ -19,9 +19,9 @@ pub const STEPS: [Step; 21] = [
     ("flash the bootloader by the probe", |bench| flash_bootloader(bench, "bootloader.elf")),
     ("power off and on, or reset", |bench| bench.restart().map(|how| Done::Passed(how.into()))),
     ("the device answers, by its crystal", device_answers),
-    ("conformance: coflash conform --reset", conform),
+    ("conformance: coflash more conform --reset", conform),
     ("option bytes: 2007h/6", option_bytes),
-    ("the update suite: coflash conform UPD --install", update_suite),
+    ("the update suite: coflash more conform UPD --install", update_suite),
     // The main job, as `cargo xtask demo` shows it.
     ("install the program of the tests", |bench| install(bench, TEST)),
     ("way back by a reset", |bench| way_back(bench, "0")),
@@ -99,7 +99,7 @@ fn option_bytes(bench: &mut Bench) -> Outcome<Done> {
     let answer = bench.coflash.call(&["read", "2007/6"])?;
     match answer.code {
         Some(0) => {
-            // `coflash conform`, the step before, judges them.
+            // `coflash more conform`, the step before, judges them.
             let document = bench.conform.last().into_iter();
             let warnings = document.flat_map(|document| process::list(document, "warnings"));
             let warnings: Vec<_> = warnings.filter_map(Value::as_str).collect();
@@ -110,12 +110,13 @@ fn option_bytes(bench: &mut Bench) -> Outcome<Done> {
 }
 
 fn conform(bench: &mut Bench) -> Outcome<Done> {
-    run_conform(bench, &["conform", "--reset"])
+    run_conform(bench, &["more", "conform", "--reset"])
 }
 
 fn update_suite(bench: &mut Bench) -> Outcome<Done> {
     let image = bench.image(V1);
-    let mut words = vec!["conform", "UPD", "--install", "--image", &image, "--board", bench.board.board];
+    let mut words =
+        vec!["more", "conform", "UPD", "--install", "--image", &image, "--board", bench.board.board];
     let power = bench.power_line.clone();
     words.extend(power.iter().flat_map(|line| ["--power-command", line]));
     let done = run_conform(bench, &words)?;
@@ -317,7 +318,7 @@ fn hung_program(bench: &mut Bench) -> Outcome<Done> {
     info_after_start(bench)?;
     // `cpsid i` and a branch to itself (ARMv7-M A7.7.29 and A7.7.12).
     install_code(bench, &[0xB672, 0xE7FE])?;
-    bench.coflash.call(&["release"])?.good()?;
+    bench.coflash.call(&["more", "release"])?.good()?;
     bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
     let (_, frames) = bench.coflash.traced(&["monitor", "--for", "9000"], &bench.work)?;
     let node = bench.coflash.node;

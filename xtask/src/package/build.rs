@@ -69,9 +69,9 @@ pub fn with_extras(release: &Release, folder: &Path) -> Outcome {
     files::copy(&built, &program)?;
     let man = folder.join("man");
     files::remove(&man)?;
-    process::output(Command::new(&program).args(["man", "--out"]).arg(&man))?;
+    process::output(Command::new(&program).args(["more", "man", "--out"]).arg(&man))?;
     for (shell, file) in [("bash", "coflash.bash"), ("zsh", "_coflash"), ("fish", "coflash.fish")] {
-        let script = process::output(Command::new(&program).args(["completions", shell]))?;
+        let script = process::output(Command::new(&program).args(["more", "completions", shell]))?;
         files::write(&folder.join("completions").join(file), script)?;
     }
     let rules = "70-coflash.rules";

@@ -51,8 +51,7 @@ fn slcan_text(frame: &Frame) -> Vec<u8> {
 
 fn flash(bus: &str) {
     let file = data("identity-110.blk");
-    let done = coflash(&["--bus", bus, "flash", "-N", "5", &file]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    coflash(&["--bus", bus, "flash", "-N", "5", &file]).good();
 }
 
 fn check(fake: &Fake) {
@@ -96,8 +95,7 @@ fn a_url_that_names_no_slcan_adapter_is_explained() {
         ("slcan:/dev/ttyACM0@2M", 2, "its bit rate must be like 125k"),
         ("slcan:/dev/there-is-none@500k", 4, "SLCAN adapter /dev/there-is-none cannot be opened"),
     ] {
-        let done = coflash(&["--bus", url, "info"]);
-        assert!(done.exit == exit && done.err.contains(words), "{url}: {}", done.err);
+        coflash(&["--bus", url, "info"]).fails(exit, &[words]);
     }
 }
 
@@ -170,10 +168,9 @@ fn socketcan() {
         command.args(["--bus", &bus, "flash", "-N", "5", &data("identity-110.blk")]);
         crate::tool::run(command.env("LD_PRELOAD", &library).env("CAN_SHIM", path))
     };
-    let done = call("vcan0", &path);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    call("vcan0", &path).good();
     check(&server.join().unwrap());
     let done = call("can9", &path);
     let _ = fs::remove_file(&path);
-    assert!(done.exit == 4 && done.err.contains("CAN interface can9 cannot be opened"), "{}", done.err);
+    done.fails(4, &["CAN interface can9 cannot be opened"]);
 }

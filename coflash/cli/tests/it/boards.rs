@@ -13,7 +13,7 @@ use kit::fake::{serve, Fake, APPLICATION};
 /// The commands with `--board`, as the manual pages name them: these are made of the definition of the
 /// command line.
 fn commands_with_a_board(folder: &Folder) -> Vec<String> {
-    assert_eq!(coflash(&["man", "--out", &folder.path("pages")]).exit, 0);
+    coflash(&["more", "man", "--out", &folder.path("pages")]).good();
     let mut found = Vec::new();
     for page in fs::read_dir(folder.path("pages")).unwrap() {
         let page = page.unwrap();
@@ -37,20 +37,29 @@ impl Room {
         let folder = folder(name);
         for role in ["root", "release"] {
             let out = folder.path(&format!("{role}.pem"));
-            assert_eq!(coflash(&["key", "new", "--role", role, "-o", &out]).exit, 0);
+            coflash(&["seal", "keys", "new", "--role", role, "-o", &out]).good();
         }
         let path = |name: &str| folder.path(name);
-        let certify =
-            ["key", "certify", "--root", &path("root.pem"), "--key", &path("release.pub"), "--epoch", "1"];
+        let certify = [
+            "seal",
+            "keys",
+            "certify",
+            "--root",
+            &path("root.pem"),
+            "--key",
+            &path("release.pub"),
+            "--epoch",
+            "1",
+        ];
         let more = ["--vendor", "0x3F", "-o", &path("release.cert")];
-        assert_eq!(coflash(&[&certify[..], &more].concat()).exit, 0);
+        coflash(&[&certify[..], &more].concat()).good();
         // A resident part that knows sealed images (`MARK_OFFSET`).
         let mut resident = vec![0x5A; 992];
         resident[0x1C..0x20].copy_from_slice(b"CBS1");
         let image = raw::read(&resident, Some(LAYOUT.bootloader.base)).unwrap();
         folder.file("bootloader.hex", ihex::emit(&image).as_bytes());
         let seal = format!(
-            "seal {} --key {} --cert {} --counter 1 --vid 0x3F --pid 1 --ver 0x10001 -o {}",
+            "seal image {} --key {} --cert {} --counter 1 --vid 0x3F --pid 1 --ver 0x10001 -o {}",
             data("program.hex"),
             path("release.pem"),
             path("release.cert"),
@@ -58,12 +67,15 @@ impl Room {
         );
         let (boot, root, out) = (path("bootloader.hex"), path("root.pub"), path("p.hex"));
         let calls = [
-            ("conform", format!("conform SDO-001 --install --image {} --node 5", data("program.hex"))),
             ("convert", format!("convert {} {}", data("program.hex"), path("out.blk"))),
             ("flash", format!("flash {} --node 5", data("program.hex"))),
             ("inspect", format!("inspect {}", data("program.hex"))),
-            ("provision", format!("provision {boot} --root {root} -o {out} --force")),
-            ("seal", seal),
+            (
+                "more-conform",
+                format!("more conform SDO-001 --install --image {} --node 5", data("program.hex")),
+            ),
+            ("seal-image", seal),
+            ("seal-provision", format!("seal provision {boot} --root {root} -o {out} --force")),
         ]
         .map(|(name, line)| (name, line.split(' ').map(str::to_owned).collect()));
         Self { folder, calls: calls.into() }
@@ -88,23 +100,20 @@ fn a_board_may_be_a_file_in_every_command() {
     let higher = map().replace("base = 0x08010000, size = 0x70000", "base = 0x08020000, size = 0x60000");
     assert_ne!(higher, map());
     let higher = room.folder.file("higher.toml", higher.as_bytes());
-    for (name, words) in room.calls.iter().filter(|(name, _)| *name != "provision") {
+    for (name, words) in room.calls.iter().filter(|(name, _)| *name != "seal-provision") {
         let (bus, server) = serve(Fake::new(APPLICATION));
-        let is_on_the_bus = ["conform", "flash"].contains(name);
+        let is_on_the_bus = ["more-conform", "flash"].contains(name);
         let more: &[&str] = if is_on_the_bus { &["--bus", &bus] } else { &[] };
-        let done = Room::call(words, &[more, &["--board", &board]].concat());
-        assert_eq!(done.exit, 0, "{name}: {}", done.err);
+        Room::call(words, &[more, &["--board", &board]].concat()).good();
         if is_on_the_bus {
             server.join().unwrap();
         }
         // It is this map that counts: the file's program begins below the program of the other one.
-        let other = Room::call(words, &[more, &["--board", &higher]].concat());
-        assert!(other.exit == 3 && other.err.contains("0x08010000"), "{name}: {} {}", other.exit, other.err);
+        Room::call(words, &[more, &["--board", &higher]].concat()).fails(3, &["0x08010000"]);
     }
     // A compact board has no place for keys.
-    let (_, words) = room.calls.iter().find(|(name, _)| *name == "provision").unwrap();
-    let done = Room::call(words, &["--board", &board]);
-    assert!(done.exit == 3 && done.err.contains("compact memory map"), "{}", done.err);
+    let (_, words) = room.calls.iter().find(|(name, _)| *name == "seal-provision").unwrap();
+    Room::call(words, &["--board", &board]).fails(3, &["compact memory map"]);
     let split = Toml(&shared_abi::layout::stm32f407g_disc1::LAYOUT).to_string();
     let split = room.folder.file("split.toml", split.as_bytes());
     let done = Room::call(words, &["--board", &split]);
@@ -130,15 +139,10 @@ fn a_hostile_file_is_refused_with_its_name_and_line_before_the_bus_is_used() {
     ];
     for (name, bytes, says) in &files {
         let file = room.folder.file(name, bytes);
-        for (command, words) in &room.calls {
+        for (_, words) in &room.calls {
             let done = Room::call(words, &["--board", &file, "--bus", "socketcand://127.0.0.1:1/x"]);
-            assert!(
-                done.exit == 3 && done.err.contains(says),
-                "{command} {name}: {} {}",
-                done.exit,
-                done.err
-            );
-            assert!(!done.err.contains('\u{1b}'), "{command}");
+            done.fails(3, &[says]);
+            assert!(!done.err.contains('\u{1b}'), "{words:?}");
         }
     }
     for (word, exit, says) in [
@@ -146,14 +150,8 @@ fn a_hostile_file_is_refused_with_its_name_and_line_before_the_bus_is_used() {
         (room.folder.path("."), 3, "."),
         ("arduino".to_owned(), 2, "For another one give the file with its memory map"),
     ] {
-        for (command, words) in &room.calls {
-            let done = Room::call(words, &["--board", &word]);
-            assert!(
-                done.exit == exit && done.err.contains(says),
-                "{command} {word}: {} {}",
-                done.exit,
-                done.err
-            );
+        for (_, words) in &room.calls {
+            Room::call(words, &["--board", &word]).fails(exit, &[says]);
         }
     }
 }
@@ -170,9 +168,9 @@ fn a_job_file_names_a_board_by_a_file_beside_it() {
         coflash(&["flash", "--job", &job, "--bus", "socketcand://127.0.0.1:1/x"])
     };
     let done = job("my-board.toml");
-    assert!(done.exit == 2 && done.err.contains("my-board has no program 2"), "{}", done.err);
+    done.fails(2, &["my-board has no program 2"]);
     let done = job("none.toml");
-    assert!(done.exit == 3 && done.err.contains("none.toml: "), "{}", done.err);
+    done.fails(3, &["none.toml: "]);
     let done = job("arduino");
-    assert!(done.exit == 2 && done.err.contains("there is no board 'arduino'"), "{}", done.err);
+    done.fails(2, &["there is no board 'arduino'"]);
 }

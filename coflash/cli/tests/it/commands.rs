@@ -62,10 +62,10 @@ fn the_steps_of_an_update_one_by_one() {
     assert!(json["seconds"].is_number());
     assert_eq!(fake.writes(), ["command 80", "command 03"]);
 
-    let (said, _, fake) = on(|| quick(BOOTLOADER), &["release"]);
+    let (said, _, fake) = on(|| quick(BOOTLOADER), &["more", "release"]);
     assert_eq!(said.out, "node 5: program 1 is released for autostart\n");
     assert_eq!(fake.writes(), ["command 83"]);
-    let (said, _, fake) = on(|| quick(BOOTLOADER), &["withdraw"]);
+    let (said, _, fake) = on(|| quick(BOOTLOADER), &["more", "withdraw"]);
     assert!(said.out.contains("is no longer released for autostart"), "{}", said.out);
     assert_eq!(fake.writes(), ["command 84"]);
 
@@ -85,10 +85,10 @@ fn a_step_that_fails_has_the_words_and_numbers_of_the_manual() {
             fake
         }
     };
-    let (said, json, _) = on(refusing(0x83, Outcome::Status(0x10)), &["release"]);
+    let (said, json, _) = on(refusing(0x83, Outcome::Status(0x10)), &["more", "release"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000110".into()));
     assert!(said.err.starts_with("error: releasing the program for autostart failed: "), "{}", said.err);
-    let (said, json, _) = on(refusing(0x84, Outcome::AbortStatus(0x0800_0022, 0x84)), &["withdraw"]);
+    let (said, json, _) = on(refusing(0x84, Outcome::AbortStatus(0x0800_0022, 0x84)), &["more", "withdraw"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
     let (said, json, _) = on(refusing(0x01, Outcome::AbortStatus(0x0800_0022, 2)), &["start"]);
     assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));
@@ -155,7 +155,7 @@ fn a_supply_that_is_too_low_is_named_with_the_cure() {
         fake.on_command = Box::new(|_| Outcome::Status(0x0001_0084));
         fake
     };
-    let (said, json, _) = on(low, &["release"]);
+    let (said, json, _) = on(low, &["more", "release"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
     assert!(said.err.contains("the supply of the device is too low to write its flash"), "{}", said.err);
     assert!(said.err.contains("check the supply") && !said.err.contains("detail"), "{}", said.err);
@@ -168,21 +168,21 @@ fn status_shows_and_clears() {
         fake.status(0x0000_000C);
         fake
     };
-    let (said, json, _) = on(failed, &["status"]);
+    let (said, json, _) = on(failed, &["more", "status"]);
     snapshot("status", &said.out);
     assert_eq!((&json["status"]["error"], &json["bootloader"]), (&0x0C.into(), &true.into()));
     assert_eq!(json["status"]["word"], 0x0C);
-    let (_, json, fake) = on(failed, &["status", "--clear"]);
+    let (_, json, fake) = on(failed, &["more", "status", "--clear"]);
     assert_eq!((&json["status"]["error"], fake.writes()), (&Value::Null, vec!["command 02"]));
 }
 
 /// The device may be named before and after the subcommand of `debug`.
 #[test]
 fn debug_knows_its_device_wherever_it_is_named() {
-    let words = ["debug", "read", "0x20000000", "64", "--node", "5"];
-    for place in [1, 4] {
+    let words = ["more", "debug", "read", "0x20000000", "64", "--node", "5"];
+    for place in [2, 5] {
         let mut words = words.to_vec();
-        let option: Vec<&str> = words.drain(4..).collect();
+        let option: Vec<&str> = words.drain(5..).collect();
         words.splice(place..place, option);
         let (bus, server) = serve(quick(APPLICATION));
         let done = coflash(&[&["--bus", &bus], &words[..]].concat());
@@ -262,9 +262,8 @@ fn reset_waits_for_the_boot_up() {
     assert_eq!(server.join().unwrap().log, ["nmt 82"]);
     // A node that is not there.
     let (bus, server) = serve(quick(APPLICATION));
-    let done = coflash(&["reset", "-N", "6", "--bus", &bus, "--boot-timeout", "50"]);
-    assert_eq!(done.exit, 5);
-    assert!(done.err.contains("node 6 has sent no boot-up message"), "{}", done.err);
+    coflash(&["reset", "-N", "6", "--bus", &bus, "--boot-timeout", "50"])
+        .fails(5, &["node 6 has sent no boot-up message"]);
     server.join().unwrap();
 }
 
@@ -284,8 +283,8 @@ fn scan_finds_who_answers_and_who_is_heard() {
         let (bus, server) = serve(devices());
         let done = coflash(
             &[&["scan", "--bus", &bus, "--listen", "50", "--sdo-timeout", "500"][..], options].concat(),
-        );
-        assert_eq!(done.exit, 0, "{}", done.err);
+        )
+        .good();
         (done.out, server.join().unwrap())
     };
     snapshot("scan", &scan(&[]).0);
@@ -320,8 +319,8 @@ fn a_trace_is_shown_again_in_words() {
     let folder = folder("trace");
     let trace = folder.path("bus.log");
     let (bus, server) = serve(quick(BOOTLOADER));
-    let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", &trace, "--segmented"]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+
+    coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", &trace, "--segmented"]).good();
     server.join().unwrap();
     let text = fs::read_to_string(&trace).unwrap();
     let frames: Vec<String> =
@@ -345,9 +344,8 @@ fn a_trace_that_cannot_be_written_is_a_warning() {
     assert!(done.err.starts_with("warning: /dev/full: writing failed: "), "{}", done.err);
     server.join().unwrap();
     let (bus, server) = serve(quick(BOOTLOADER));
-    let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/there/is/none"]);
-    assert_eq!(done.exit, 4);
-    assert!(done.err.contains("trace file /there/is/none cannot be opened"), "{}", done.err);
+    coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/there/is/none"])
+        .fails(4, &["trace file /there/is/none cannot be opened"]);
     assert!(server.join().unwrap().sent.is_empty());
 }
 
@@ -369,9 +367,7 @@ fn monitor_shows_a_log() {
     assert_eq!((&lines[1]["time"], &lines[1]["frame"]), (&1.5.into(), &"706#7F".into()));
     assert_eq!(coflash(&["monitor", "--replay", &log, "--count", "1"]).out.lines().count(), 1);
     let bad = folder.file("bad", b"(1.0) can0 705#00\n(1.0) can0 705#0\n");
-    let done = coflash(&["monitor", "--replay", &bad]);
-    assert_eq!(done.exit, 3);
-    assert!(done.err.contains("bad, line 2: its data are not pairs"), "{}", done.err);
+    coflash(&["monitor", "--replay", &bad]).fails(3, &["bad, line 2: its data are not pairs"]);
     // As other programs store it: a byte order mark, and CR at the end of lines.
     for end in ["\r\n", "\r"] {
         let text =
@@ -380,8 +376,7 @@ fn monitor_shows_a_log() {
         assert!(done.exit == 0 && done.out.lines().count() == 3, "{end:?}: {}{}", done.out, done.err);
     }
     let binary = folder.file("binary", &[0xFF, 0xFE, 0]);
-    let done = coflash(&["monitor", "--replay", &binary]);
-    assert!(done.exit == 3 && done.err.contains("store it as UTF-8"), "{}", done.err);
+    coflash(&["monitor", "--replay", &binary]).fails(3, &["store it as UTF-8"]);
     assert_eq!(coflash(&["monitor", "--replay", &folder.path("none")]).exit, 3);
 }
 
@@ -476,8 +471,7 @@ fn lss_says_what_it_does() {
         (&["assign"], "--node"),
         (&["bit-rate", "300"], "LSS knows 1000"),
     ] {
-        let done = coflash(&[&["lss"][..], options].concat());
-        assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);
+        coflash(&[&["lss"][..], options].concat()).fails(2, &[words]);
     }
 }
 
@@ -537,7 +531,7 @@ impl coboot_can::Adapter for LssDevice {
 /// Runs the shell with these lines on its standard input.
 fn shell(arguments: &[&str], lines: &str) -> crate::tool::Done {
     let mut child = crate::tool::command()
-        .arg("shell")
+        .args(["more", "shell"])
         .args(arguments)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -568,11 +562,13 @@ fn the_shell_runs_one_command_after_the_other() {
     // The first failure ends it, with that command's exit code.
     let done = shell(&[], &format!("inspect {file}x\ninspect {file}\n"));
     assert_eq!((done.exit, done.out.as_str()), (3, ""));
-    for (line, words) in
-        [("nonsense", "unrecognized subcommand"), ("shell", "already the shell"), ("info 'x", "not closed")]
-    {
-        let done = shell(&[], line);
-        assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);
+    for (line, words) in [
+        ("nonsense", "unrecognized subcommand"),
+        ("more shell", "already the shell"),
+        ("release", "'coflash more release'"),
+        ("info 'x", "not closed"),
+    ] {
+        shell(&[], line).fails(2, &[words]);
     }
     let done = shell(&["--json"], &format!("inspect {file}"));
     assert_eq!(serde_json::from_str::<Value>(&done.out).unwrap()["bytes"], 803);
@@ -587,13 +583,13 @@ fn completions_and_manual_pages_are_written() {
         ("fish", "complete -c coflash"),
         ("powershell", "Register-ArgumentCompleter"),
     ] {
-        let done = coflash(&["completions", shell]);
+        let done = coflash(&["more", "completions", shell]);
         assert!(done.exit == 0 && done.out.contains(words) && done.out.contains("check-target"), "{shell}");
     }
-    let done = coflash(&["man"]);
+    let done = coflash(&["more", "man"]);
     assert!(done.exit == 0 && done.out.contains(".TH coflash"), "{}", done.out);
     let folder = folder("man");
-    assert_eq!(coflash(&["man", "--out", &folder.path("pages")]).exit, 0);
+    coflash(&["more", "man", "--out", &folder.path("pages")]).good();
     let page = fs::read_to_string(folder.path("pages/coflash-flash.1")).unwrap();
     assert!(page.contains("check\\-target"), "{page}");
     let mut rest = page.as_str();
@@ -612,7 +608,8 @@ fn completions_and_manual_pages_are_written() {
         assert!(own.contains(words), "{section}: {own}");
         rest = behind;
     }
-    for command in ["", "-read", "-write", "-nmt", "-lss-assign"] {
+    for command in ["", "-read", "-write", "-nmt", "-lss-assign", "-seal", "-seal-keys-new", "-more-release"]
+    {
         assert!(fs::metadata(folder.path(&format!("pages/coflash{command}.1"))).is_ok(), "{command}");
     }
 }
@@ -640,12 +637,12 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     assert!(done.out.starts_with("node 5, 1018h/2: 1234"), "{}{}", done.out, done.err);
     server.join().unwrap();
     let (bus, server) = serve(quick(BOOTLOADER));
-    let done = coflash(&["reset", "--all", "--bus", &bus, "--config", &config, "--boot-timeout", "300"]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+
+    coflash(&["reset", "--all", "--bus", &bus, "--config", &config, "--boot-timeout", "300"]).good();
     let fake = server.join().unwrap();
     assert_eq!(fake.sent[0].to_string(), "000#8100");
-    let done = coflash(&["lss", "assign", "--bus", "socketcand://127.0.0.1:1/x", "--config", &config]);
-    assert!(done.exit == 2 && done.err.contains("--node"), "{}", done.err);
+    coflash(&["lss", "assign", "--bus", "socketcand://127.0.0.1:1/x", "--config", &config])
+        .fails(2, &["--node"]);
     for (text, exit, words) in [
         ("bus = 'x\n", 3, "line 1: "),
         ("\n\n=\n", 3, "line 3: "),
@@ -654,8 +651,7 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
         ("node = 200\n", 2, "node-IDs are 1 to 127"),
     ] {
         let file = folder.file("bad.toml", text.as_bytes());
-        let done = coflash(&["info", "--config", &file, "--bus", "socketcand://127.0.0.1:1/x"]);
-        assert!(done.exit == exit && done.err.contains(words), "{text}: {} {}", done.exit, done.err);
+        coflash(&["info", "--config", &file, "--bus", "socketcand://127.0.0.1:1/x"]).fails(exit, &[words]);
     }
     assert_eq!(coflash(&["info", "--config", &folder.path("none.toml")]).exit, 3);
 }
@@ -668,8 +664,7 @@ fn help_is_complete() {
         [&["-h"][..], &["--help"], &["flash", "-h"], &["flash", "--help"], &["lss", "assign", "--help"]]
     {
         let mut tool = crate::tool::command();
-        let done = run(tool.args(command).env_remove("SOURCE_DATE_EPOCH"));
-        assert_eq!(done.exit, 0);
+        let done = run(tool.args(command).env_remove("SOURCE_DATE_EPOCH")).good();
         text.push_str(&done.out);
         text.push_str("\n----\n");
     }

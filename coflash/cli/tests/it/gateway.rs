@@ -244,15 +244,15 @@ fn a_binary_without_an_address_goes_to_devices_that_have_none() {
     // This file is not a program, and is refused with a message.
     let done =
         coflash(&[&["--bus", "socketcand://127.0.0.1:1/x"][..], &binary, &["--dialect", "raw"]].concat());
-    assert!(done.exit == 3 && done.err.contains("is not a program: its first word"), "{}", done.err);
+    done.fails(3, &["is not a program: its first word"]);
     let done = coflash(&[&["--bus", &bus][..], &binary, &["--dialect", "raw", "--force"]].concat());
     assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
     server.0.join().unwrap();
     assert!(*server.1.lock().unwrap() == fs::read(&file).unwrap());
     // Blocks and Intel HEX have addresses.
     for dialect in ["block", "hex", "esacademy", "auto"] {
-        let done = coflash(&[&["--bus", &bus][..], &binary, &["--dialect", dialect]].concat());
-        assert!(done.exit == 3 && done.err.contains("give --start-address or --board"), "{}", done.err);
+        coflash(&[&["--bus", &bus][..], &binary, &["--dialect", dialect]].concat())
+            .fails(3, &["give --start-address or --board"]);
     }
 }
 
@@ -266,7 +266,7 @@ fn what_reads_and_writes_objects_works_through_a_gateway() {
     let done = coflash(&["--bus", &bus, "info", "-N", "5"]);
     assert!(done.exit == 0 && done.out.contains("vendor-ID         0000003Fh"), "{}{}", done.out, done.err);
     let (bus, _, device) = behind(quick(APPLICATION));
-    assert_eq!(coflash(&["--bus", &bus, "enter", "-N", "5"]).exit, 0);
+    coflash(&["--bus", &bus, "enter", "-N", "5"]).good();
     assert_eq!(device.lock().unwrap().fake.running, Some(BOOTLOADER));
     // Several devices: one after the other, and one that is missing does not stop the others.
     let (bus, _, device) = behind(quick(BOOTLOADER));
@@ -284,17 +284,13 @@ fn what_the_device_refuses_has_the_same_words_as_on_the_bus() {
     let mut fake = quick(BOOTLOADER);
     fake.on_block = Box::new(|_| Outcome::AbortStatus(0x0800_0020, 0x0E));
     let (bus, ..) = behind(fake);
-    let done = coflash(&["--bus", &bus, "flash", "-N", "5", &data("plain-400.blk")]);
-    assert_eq!(done.exit, 6, "{}", done.err);
-    assert!(done.err.contains("[0x60000007]"), "{}", done.err);
+    coflash(&["--bus", &bus, "flash", "-N", "5", &data("plain-400.blk")]).fails(6, &["[0x60000007]"]);
     let (bus, ..) = behind(quick(BOOTLOADER));
-    let done = coflash(&["--bus", &bus, "read", "-N", "5", "2000"]);
-    assert_eq!(done.exit, 6, "{}", done.err);
-    assert!(done.err.contains("node 5 refuses reading 2000h/0: abort 06020000h"), "{}", done.err);
+    coflash(&["--bus", &bus, "read", "-N", "5", "2000"])
+        .fails(6, &["node 5 refuses reading 2000h/0: abort 06020000h"]);
     let (bus, ..) = behind(quick(BOOTLOADER));
     let done = coflash(&["--bus", &bus, "read", "-N", "6", "1000"]);
-    assert_eq!(done.exit, 5, "{}", done.err);
-    assert!(done.err.contains("node 6 does not answer"), "{}", done.err);
+    done.fails(5, &["node 6 does not answer"]);
     // The bus was not observed.
     assert!(done.err.contains("what to do: check that node 6 is the right one"), "{}", done.err);
 }
@@ -304,13 +300,10 @@ fn what_the_device_refuses_has_the_same_words_as_on_the_bus() {
 fn what_listens_to_the_bus_is_refused_in_words() {
     let (bus, ..) = behind(quick(BOOTLOADER));
     for command in [&["scan"][..], &["monitor"], &["lss", "fastscan"], &["reset", "--all"]] {
-        let done = coflash(&[&["--bus", &bus][..], command].concat());
-        assert_eq!(done.exit, 2, "{command:?}: {}", done.err);
-        assert!(done.err.contains("a gateway carries only SDO"), "{}", done.err);
+        coflash(&[&["--bus", &bus][..], command].concat()).fails(2, &["a gateway carries only SDO"]);
     }
     let file = data("plain-400.blk");
-    let done = coflash(&["--bus", &bus, "flash", &file, "--ser_num", "1"]);
-    assert!(done.exit == 2 && done.err.contains("LSS address"), "{}", done.err);
+    coflash(&["--bus", &bus, "flash", &file, "--ser_num", "1"]).fails(2, &["LSS address"]);
     // The gateway on the CAN bus of the manual's tool is a different one.
     for option in ["--gateway_id", "--network_id"] {
         let done = coflash(&["--bus", &bus, "flash", &file, option, "3"]);
@@ -325,8 +318,7 @@ fn what_listens_to_the_bus_is_refused_in_words() {
         ("cia309://127.0.0.1:1/+1", "from 0 to 65535"),
         ("cia309://127.0.0.1:1/", "from 0 to 65535"),
     ] {
-        let done = coflash(&["--bus", url, "info"]);
-        assert!(done.exit == 2 && done.err.contains(words), "{url}: {}", done.err);
+        coflash(&["--bus", url, "info"]).fails(2, &[words]);
     }
 }
 

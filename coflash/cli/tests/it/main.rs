@@ -59,8 +59,7 @@ fn convert_writes_the_block_file_of_the_manual() {
         ),
     ] {
         let input = data("program.hex");
-        let done = coflash(&[&["convert", &input, &out][..], &arguments].concat());
-        assert_eq!(done.exit, 0, "{}", done.err);
+        coflash(&[&["convert", &input, &out][..], &arguments].concat()).good();
         assert!(fs::read(&out).unwrap() == fs::read(data(expected)).unwrap(), "{arguments:?}");
     }
     let done = coflash(&["convert", &data("program.elf"), &out]);
@@ -84,8 +83,7 @@ fn a_build_script_for_the_manuals_converter_works() {
     let label = ["--vid", "0", "--pid", "1234", "--ver", "0x00640A01"];
     let files = ["blcop_app.hex", "blcop_app.bin"];
     let first = ["-I", "ihex", "-O", "Binary", "--block_size", "0x110"];
-    let done = call(&[&first[..], &region, &label, &files, &["--temp"]].concat());
-    assert_eq!(done.exit, 0, "{}", done.err);
+    call(&[&first[..], &region, &label, &files, &["--temp"]].concat()).good();
     assert!(fs::read(folder.path("blcop_app.bin")).unwrap() == fs::read(data("release-110.blk")).unwrap());
     assert!(fs::read(folder.path("blcop_app.tmp")).unwrap() == fs::read(data("program.bin")).unwrap());
     // Octal and suffixed numbers, the byte-wide fill of 2008, the CRC-16, and no name for the
@@ -95,8 +93,7 @@ fn a_build_script_for_the_manuals_converter_works() {
     assert_eq!(done.exit, 0, "{}", done.err);
     assert!(fs::read(folder.path("blcop_app.blk")).unwrap() == fs::read(data("crc16-400.blk")).unwrap());
     for format in ["S3", "S5", "S9", "srec"] {
-        let done = call(&["-I", format, &data("program.s3"), "s.blk", "--start_address", "0x08010000"]);
-        assert_eq!(done.exit, 0, "{}", done.err);
+        call(&["-I", format, &data("program.s3"), "s.blk", "--start_address", "0x08010000"]).good();
         assert!(fs::read(folder.path("s.blk")).unwrap() == fs::read(data("plain-400.blk")).unwrap());
     }
 }
@@ -115,8 +112,7 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
         ("crc16-400.blk", &["--vid", "1", "--pid", "2"], "CRC-16", true),
     ] {
         let input = data(name);
-        let done = coflash(&[&["convert", "-I", "block", &input, &out][..], options].concat());
-        assert_eq!(done.exit, 0, "{}", done.err);
+        let done = coflash(&[&["convert", "-I", "block", &input, &out][..], options].concat()).good();
         let words = format!("{input}: this is already a block file; it keeps its {kept}\n");
         assert!(done.out.starts_with(&words), "{}", done.out);
         assert_eq!(done.err.contains("cannot change a block file"), warns, "{options:?}: {}", done.err);
@@ -133,14 +129,13 @@ fn a_nameplate_goes_into_its_block() {
     let folder = folder("nameplate");
     let out = folder.path("plate.hex");
     let numbers = ["--vendor", "0x123", "--product", "0x5EA10007", "--revision", "0x00020003"];
-    let make = |more: &[&str]| coflash(&[&["nameplate", &out][..], &numbers, more].concat());
+    let make = |more: &[&str]| coflash(&[&["seal", "nameplate", &out][..], &numbers, more].concat());
     for (more, address, locks) in [
         (&["--serial", "123456"][..], 0x1FFF_7800, 0),
         (&["--serial", "123456", "--lock"], 0x1FFF_7800, 16),
         (&["--serial", "123456", "--block", "14", "--lock"], 0x1FFF_79C0, 2),
     ] {
-        let done = make(more);
-        assert_eq!(done.exit, 0, "{}", done.err);
+        make(more).good();
         let image = ihex::read(&fs::read(&out).unwrap()).unwrap();
         assert_eq!(image.bytes(address), Some(PLATE));
         // The lock bytes are those up to 1FFF_7A0Fh.
@@ -162,12 +157,11 @@ fn a_nameplate_goes_into_its_block() {
         (&["--block", "16"][..], "0..=15"),
         (&["--serial", "0x100000000"], "it is not a number of up to 32 bits"),
     ] {
-        let done = make(more);
-        assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);
+        make(more).fails(2, &[words]);
     }
     // What it makes is nothing for a device's flash.
-    let done = coflash(&["convert", &out, &folder.path("none.blk"), "--board", "stm32f407g-disc1"]);
-    assert!(done.exit == 3 && done.err.contains("one-time programmable"), "{} {}", done.exit, done.err);
+    coflash(&["convert", &out, &folder.path("none.blk"), "--board", "stm32f407g-disc1"])
+        .fails(3, &["one-time programmable"]);
 }
 
 /// Each fault of a file comes with something that the user can do.
@@ -218,8 +212,8 @@ fn each_fault_of_a_file_says_what_to_do() {
 #[test]
 fn inspect_tells_what_a_file_holds() {
     let shown = |file: &str, options: &[&str]| {
-        let done = run(crate::tool::command().current_dir(data("")).args(["inspect", file]).args(options));
-        assert_eq!(done.exit, 0, "{}", done.err);
+        let done =
+            run(crate::tool::command().current_dir(data("")).args(["inspect", file]).args(options)).good();
         done.out
     };
     snapshot("inspect-release", &shown("release-110.blk", &[]));
@@ -244,9 +238,8 @@ fn inspect_tells_what_a_file_holds() {
     let far =
         fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", ":020000040800F2", 1);
     let far = folder.file("far.hex", far.as_bytes());
-    assert_eq!(coflash(&["inspect", &far]).exit, 0);
-    let done = coflash(&["inspect", &far, "--board", "nucleo-f446re"]);
-    assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
+    coflash(&["inspect", &far]).good();
+    coflash(&["inspect", &far, "--board", "nucleo-f446re"]).fails(3, &["lies outside"]);
 }
 
 /// A bus with a valid URL that does not exist.
@@ -270,16 +263,14 @@ fn what_is_no_file_or_too_large_is_not_read() {
         (&large, "large.elf: has 67108865 bytes, and a firmware file has at most 67108864"),
     ] {
         for command in [&["inspect"][..], &["convert"], &["--bus", NOWHERE, "flash"]] {
-            let done = coflash(&[command, &[file]].concat());
-            assert!(done.exit == 3 && done.err.contains(words), "{command:?} {}", done.err);
+            coflash(&[command, &[file]].concat()).fails(3, &[words]);
         }
     }
     for (option, file) in [("--job", "/dev/zero"), ("--job", settings.as_str())] {
-        let done = coflash(&["--bus", NOWHERE, "flash", option, file]);
-        assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
+        coflash(&["--bus", NOWHERE, "flash", option, file]).fails(3, &["has more than 1048576 bytes"]);
     }
-    let done = coflash(&["--config", "/dev/zero", "inspect", &data("program.hex")]);
-    assert!(done.exit == 3 && done.err.contains("has more than 1048576 bytes"), "{}", done.err);
+    coflash(&["--config", "/dev/zero", "inspect", &data("program.hex")])
+        .fails(3, &["has more than 1048576 bytes"]);
 }
 
 /// The image of a bootloader is refused before the bus is opened, and so is an image that is not a
@@ -304,12 +295,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
         (&zeros, &["--board", "nucleo-f446re"], "zeros.bin: is not a program: all its bytes are 00h"),
         (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is not a program"),
     ] {
-        let done = flash(file, options);
-        assert!(
-            done.exit == 3 && done.err.contains(words) && done.err.contains("0x60000021"),
-            "{}",
-            done.err
-        );
+        flash(file, options).fails(3, &[words, "0x60000021"]);
         // With --force it passes, and fails because there is no bus; so do data, which may be any
         // bytes.
         let done = flash(file, &[options, &["--force"]].concat());
@@ -356,8 +342,8 @@ fn the_label_is_shown_and_goes_into_block_0() {
             .args(["convert", &file, &out])
             .args(raw)
             .args(options)
-            .env_remove("SOURCE_DATE_EPOCH"));
-        assert_eq!(done.exit, 0, "{}", done.err);
+            .env_remove("SOURCE_DATE_EPOCH"))
+        .good();
         let block: Vec<u8> = data.iter().flat_map(|word: &u32| word.to_le_bytes()).collect();
         let bytes = fs::read(&out).unwrap();
         assert_eq!(bytes[8..12], (block.len() as u32).to_le_bytes(), "{options:?}");
@@ -408,8 +394,7 @@ fn the_date_comes_from_the_environment() {
         "--ver",
         "0x00640A01",
     ]);
-    let done = run(command.env("SOURCE_DATE_EPOCH", "1420070400"));
-    assert_eq!(done.exit, 0, "{}", done.err);
+    run(command.env("SOURCE_DATE_EPOCH", "1420070400")).good();
     assert!(fs::read(&out).unwrap() == fs::read(data("release-110.blk")).unwrap());
 }
 
@@ -466,8 +451,8 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
         }
         assert!(!Path::new(&out).exists());
     }
-    let missing = coflash(&["--bus", &bus, "flash", &folder.path("missing.hex")]);
-    assert!(missing.exit == 3 && missing.err.contains("missing.hex: cannot be read: "), "{}", missing.err);
+    coflash(&["--bus", &bus, "flash", &folder.path("missing.hex")])
+        .fails(3, &["missing.hex: cannot be read: "]);
     assert_eq!(listener.accept().unwrap_err().kind(), ErrorKind::WouldBlock, "nobody came to the bus");
 }
 
@@ -493,9 +478,7 @@ fn wrong_usage_is_explained() {
         (&["-q", "-v", "convert", &hex, "out"], "cannot be used with"),
         (&[], "Usage"),
     ] {
-        let done = coflash(arguments);
-        assert_eq!(done.exit, 2, "{arguments:?}: {}", done.err);
-        assert!(done.err.contains(words), "{}\n not {words}", done.err);
+        coflash(arguments).fails(2, &[words]);
     }
 }
 
@@ -534,8 +517,7 @@ fn flash_and_info_over_a_socket() {
     }
 
     let (bus, _server) = serve(fake);
-    let done = run(crate::tool::command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus));
-    assert_eq!(done.exit, 0, "{}", done.err);
+    let done = run(crate::tool::command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus)).good();
     assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
 }
 
@@ -555,8 +537,7 @@ fn a_script_for_the_manuals_download_tools_works() {
         fake.erase_time = Duration::from_millis(30);
         fake.restart_time = Duration::from_millis(10);
         let (bus, server) = serve(fake);
-        let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat());
-        assert_eq!(done.exit, 0, "{}", done.err);
+        let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat()).good();
         assert_eq!(done.err.contains("--vxd_type is ignored"), dot_net, "{}", done.err);
         let fake = server.join().unwrap();
         assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
@@ -567,9 +548,7 @@ fn a_script_for_the_manuals_download_tools_works() {
         );
     }
     for (option, value, words) in [("--gateway_id", "3", "SDO gateway"), ("-B", "9", "0 (1 Mbit/s) to 8")] {
-        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]);
-        assert_eq!(done.exit, 2, "{}", done.err);
-        assert!(done.err.contains(words), "{}", done.err);
+        coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]).fails(2, &[words]);
     }
 }
 
@@ -592,8 +571,8 @@ fn the_target_is_checked_before_anything_is_erased() {
     }
     // A file that names no device cannot be checked, unless the command line names one.
     let plain = data("program.elf");
-    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--check-target", &plain]);
-    assert!(done.exit == 2 && done.err.contains("--vid and --pid"), "{}", done.err);
+    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--check-target", &plain])
+        .fails(2, &["--vid and --pid"]);
     let mut fake = Fake::new(BOOTLOADER);
     fake.erase_time = Duration::from_millis(30);
     let (bus, server) = serve(fake);
@@ -611,8 +590,8 @@ fn the_target_is_checked_before_anything_is_erased() {
         "1234",
         "--no-start",
         &plain,
-    ]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+    ])
+    .good();
     let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!((&json["command"], &json["node"], &json["program"]), (&"flash".into(), &5.into(), &1.into()));
     assert_eq!((&json["size"], &json["running"]), (&4001.into(), &serde_json::Value::Null));
@@ -659,9 +638,7 @@ fn a_device_that_fails_has_the_exit_code_of_its_failure() {
     ] {
         let (bus, server) = serve(fake);
         let file = data("plain-400.blk");
-        let done = coflash(&["flash", "--bus", &bus, "-N", "5", &file, "--boot-timeout", "300"]);
-        assert_eq!(done.exit, exit, "{}", done.err);
-        assert!(done.err.contains(words), "{}\n not {words}", done.err);
+        coflash(&["flash", "--bus", &bus, "-N", "5", &file, "--boot-timeout", "300"]).fails(exit, &[words]);
         server.join().unwrap();
     }
 }

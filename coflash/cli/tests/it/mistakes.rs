@@ -254,7 +254,7 @@ const MISTAKES: &[Mistake] = &[
         "info -N 5 {quick} --bus {bus}",
         Device(absent),
         5,
-        &["node 5 does not answer", "nothing at all is heard", "bit rate", "coflash catch", "strap"],
+        &["node 5 does not answer", "nothing at all is heard", "bit rate", "coflash more catch", "strap"],
     ),
     Mistake(
         "info -N 5 {quick} --bus {bus}",
@@ -282,7 +282,7 @@ const MISTAKES: &[Mistake] = &[
         &[
             "node 5 has not answered since the program was started",
             "switch the device off and on",
-            "coflash catch",
+            "coflash more catch",
         ],
     ),
     Mistake(
@@ -313,7 +313,7 @@ const MISTAKES: &[Mistake] = &[
         "enter -N 5 {quick} --bus {bus}",
         Device(|| refusing_command(0x80, Outcome::Ignore, APPLICATION)),
         7,
-        &["node 5", "coflash catch", "strap"],
+        &["node 5", "coflash more catch", "strap"],
     ),
     Mistake(
         "flash -N 5 {hex} --vid 0x40 --pid 1234 --check-target {quick} --bus {bus}",

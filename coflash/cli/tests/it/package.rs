@@ -8,7 +8,8 @@ use coflash_core::device::lss::LssAddress;
 use coflash_core::file::sealed::{Sealer, SigningKey};
 use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
-use crate::tool::{coflash, data, folder};
+use crate::tool::{coflash, data, folder, Done};
+use kit::folder::Folder;
 
 fn recipe(text: &str, folder: &Path) -> Result<(Recipe, Vec<Part>), String> {
     let parsed = Recipe::parse(text, folder);
@@ -164,27 +165,41 @@ fn a_file_that_names_its_device_needs_no_other_name() {
     }
 }
 
-/// By the command line: the package beside its recipe, its content, and the options that contradict it.
+/// A recipe, its package `line.cpk`, and the keys that have signed it.
+struct Line(Folder);
+
+impl Line {
+    fn new(test: &str) -> Self {
+        let line = Self(folder(test));
+        fs::copy(data("plain-400.blk"), line.0.join("b.blk")).unwrap();
+        line.0.file("line.toml", b"[[program]]\nimage = 'b.blk'\nvendor = 1\nproduct = 2\n");
+        for name in ["root", "release", "other"] {
+            let role = if name == "other" { "root" } else { name };
+            coflash(&["seal", "keys", "new", "--role", role, "-o", &line.at(&format!("{name}.pem"))]).good();
+        }
+        let (root, key) = (line.at("root.pem"), line.at("release.pub"));
+        let certify =
+            ["seal", "keys", "certify", "--root", &root, "--key", &key, "--epoch", "1", "--vendor", "1"];
+        coflash(&certify).good();
+        line.package(&["--key", &line.at("release.pem"), "--cert", &line.at("release.cert")]).good();
+        line
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.0.path(name)
+    }
+
+    fn package(&self, more: &[&str]) -> Done {
+        coflash(&[&["package", &self.at("line.toml")], more].concat())
+    }
+}
+
+/// By the command line: the package beside its recipe, and its content.
 #[test]
 fn the_command_makes_and_shows_a_package() {
-    let folder = folder("recipe-command");
-    fs::copy(data("plain-400.blk"), folder.join("b.blk")).unwrap();
-    let recipe = folder.write("line.toml", b"[[program]]\nimage = 'b.blk'\nvendor = 1\nproduct = 2\n");
-    let (recipe, package) = (recipe.to_str().unwrap(), folder.join("line.cpk"));
-    let package = package.to_str().unwrap();
-    let key = |name: &str| folder.join(name).to_str().unwrap().to_owned();
-    for role in ["root", "release"] {
-        let file = key(&format!("{role}.pem"));
-        assert_eq!(coflash(&["key", "new", "--role", role, "-o", &file]).exit, 0);
-    }
-    let (root, release, cert) = (key("root.pem"), key("release.pem"), key("release.cert"));
-    let public = key("release.pub");
-    let certify = ["key", "certify", "--root", &root, "--key", &public, "--epoch", "1", "--vendor", "1"];
-    assert_eq!(coflash(&certify).exit, 0);
-    let made = coflash(&["package", recipe, "--key", &release, "--cert", &cert]);
-    assert_eq!(made.exit, 0, "{}", made.err);
-    let shown = coflash(&["inspect", package, "--trust", &key("root.pub")]);
-    assert_eq!(shown.exit, 0, "{}", shown.err);
+    let line = Line::new("recipe-command");
+    let (package, root) = (line.at("line.cpk"), line.at("root.pub"));
+    let shown = coflash(&["inspect", &package, "--trust", &root]).good();
     assert!(
         shown.out.contains("b: program 1 of 4001 bytes, for vendor 00000001h, product 00000002h"),
         "{}",
@@ -192,41 +207,44 @@ fn the_command_makes_and_shows_a_package() {
     );
     assert!(shown.out.contains("signed by key ") && !shown.out.contains("not checked"), "{}", shown.out);
     // With a second signer, whose root is not named.
-    let (other, both) = (key("other.pem"), key("both.cpk"));
-    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &other]).exit, 0);
-    let keys = ["--key", &release, "--cert", &cert, "--key", &other];
-    assert_eq!(coflash(&[&["package", recipe, "-o", &both][..], &keys].concat()).exit, 0);
-    let shown = coflash(&["inspect", &both, "--trust", &key("root.pub")]);
+    let both = line.at("both.cpk");
+    let (release, cert, other) = (line.at("release.pem"), line.at("release.cert"), line.at("other.pem"));
+    line.package(&["-o", &both, "--key", &release, "--cert", &cert, "--key", &other]).good();
+    let shown = coflash(&["inspect", &both, "--trust", &root]);
     for words in ["signed by key ", "not checked: another root: key "] {
         assert_eq!(shown.out.matches(words).count(), 1, "{}", shown.out);
     }
-    let said = coflash(&["flash", &both, "--trust", &key("root.pub"), "--bus", "slcan:no-such-port"]);
+    let said = coflash(&["flash", &both, "--trust", &root, "--bus", "slcan:no-such-port"]);
     assert!(said.out.contains("not checked: another root: key "), "{}{}", said.out, said.err);
-    let open = key("open.cpk");
-    assert_eq!(coflash(&["package", recipe, "-o", &open]).exit, 0);
+    let open = line.at("open.cpk");
+    line.package(&["-o", &open]).good();
     let said = coflash(&["flash", &open, "--bus", "slcan:no-such-port"]);
     assert!(said.out.contains("not signed"), "{}{}", said.out, said.err);
-    let stranger = coflash(&["inspect", package, "--trust", &public]);
-    assert_eq!(stranger.exit, 3);
-    assert!(
-        stranger.err.contains("is signed by a stranger") && stranger.err.contains("[0x60000408]"),
-        "{}",
-        stranger.err
-    );
+    coflash(&["inspect", &package, "--trust", &line.at("release.pub")])
+        .fails(3, &["is signed by a stranger", "[0x60000408]"]);
+    // The bus of the manual's options, which is not there.
+    let done = coflash(&["flash", &package, "--vxd_type", "16", "--device_no", "99"]);
+    let port = if cfg!(windows) { "COM99" } else { "ttyS98" };
+    assert!(done.exit != 0 && done.err.contains(port), "{}", done.err);
+}
+
+/// Files and options that contradict a package, or belong to one alone.
+#[test]
+fn what_contradicts_a_package_is_refused() {
+    let line = Line::new("recipe-refused");
+    let (recipe, package) = (&*line.at("line.toml"), &*line.at("line.cpk"));
+    let (root, release, cert) = (line.at("root.pem"), line.at("release.pem"), line.at("release.cert"));
+    let public = line.at("release.pub");
     // A root of the configuration is for packages, and any other file has nothing to do with it.
-    let config = folder.write("coflash.toml", format!("trust = '{public}'\nnode = 5\n").as_bytes());
-    let config = config.to_str().unwrap();
+    let config = line.0.file("coflash.toml", format!("trust = '{public}'\nnode = 5\n").as_bytes());
+    let config = &*config;
     // The same file by another path.
-    fs::create_dir(folder.join("aside")).unwrap();
-    let (aside, image) = (key("aside/../line.toml"), key("aside/../b.blk"));
+    fs::create_dir(line.0.join("aside")).unwrap();
+    let (aside, image) = (line.at("aside/../line.toml"), line.at("aside/../b.blk"));
     // Another file with the name of a package does not get past this root.
-    let named = folder.join("x.CPK");
-    fs::copy(data("plain-400.blk"), &named).unwrap();
-    let named = named.to_str().unwrap();
-    let job = folder.write("job.toml", b"[[program]]\nimage = 'a.blk'\nnodes = [5]\nstart = false\n");
-    let before = folder.write("before.toml", b"image = 'a.blk'\n[[device]]\nnode = 5\n");
-    let before = before.to_str().unwrap();
-    let job = job.to_str().unwrap();
+    let named = &*line.0.file("x.CPK", &fs::read(data("plain-400.blk")).unwrap());
+    let job = &*line.0.file("job.toml", b"[[program]]\nimage = 'a.blk'\nnodes = [5]\nstart = false\n");
+    let before = &*line.0.file("before.toml", b"image = 'a.blk'\n[[device]]\nnode = 5\n");
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
@@ -271,12 +289,6 @@ fn the_command_makes_and_shows_a_package() {
         (&["ui", "--service", before], 3, "line 2: [[device]] is of the job files of before"),
         (&["flash", "--job", before], 3, "line 2: [[device]] is of the job files of before"),
     ] {
-        let done = coflash(words);
-        assert_eq!(done.exit, exit, "{words:?}: {}", done.err);
-        assert!(done.err.contains(error), "{words:?}: {}", done.err);
+        coflash(words).fails(exit, &[error]);
     }
-    // The bus of the manual's options, which is not there.
-    let done = coflash(&["flash", package, "--vxd_type", "16", "--device_no", "99"]);
-    let port = if cfg!(windows) { "COM99" } else { "ttyS98" };
-    assert!(done.exit != 0 && done.err.contains(port), "{}", done.err);
 }

@@ -14,8 +14,7 @@ fn flash_knows_a_bootloader_by_its_header() {
     let file = folder.file("new.bin", &image(NEW));
     let report = folder.path("report.json");
     let (url, server) = serve(device(APPLICATION, |_| {}).0);
-    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5", "--report", &report]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5", "--report", &report]).good();
     let crc = word_of(&image(NEW), 4);
     for words in [
         &format!("{file}: bootloader 1.3 of 320 bytes, CRC {crc:08X}h\n")[..],
@@ -43,8 +42,7 @@ fn flash_knows_a_bootloader_by_its_header() {
     // By a job file, too.
     let job = folder.file("job.toml", b"[[program]]\nimage = 'new.bin'\nnodes = [5]\n");
     let (url, server) = serve(device(BOOTLOADER, |_| {}).0);
-    let done = coflash(&["--bus", &url, "flash", "--job", &job]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let done = coflash(&["--bus", &url, "flash", "--job", &job]).good();
     assert!(done.out.ends_with("1 of 1 devices are done\n"), "{}", done.out);
     drop(server.join());
 }
@@ -55,13 +53,8 @@ fn flash_refuses_what_is_no_bootloader_for_a_device() {
     let folder = folder("renew-refused");
     let file = folder.file("new.bin", &image(NEW));
     for option in ["--no-trial", "--no-start"] {
-        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file, option]);
-        assert_eq!(done.exit, 2, "{}", done.err);
-        assert!(
-            done.err.contains("a new bootloader is tried before it replaces the old one"),
-            "{}",
-            done.err
-        );
+        coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file, option])
+            .fails(2, &["a new bootloader is tried before it replaces the old one"]);
     }
     let mut bench = image(NEW);
     bench[4..8].fill(0);
@@ -73,8 +66,6 @@ fn flash_refuses_what_is_no_bootloader_for_a_device() {
         (bench, "it is a bootloader without a CRC: build it by cargo xtask build, which writes the CRC"),
         (damaged, "it is a damaged bootloader: its header has the CRC"),
     ] {
-        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file]);
-        assert_eq!(done.exit, 3, "{}", done.err);
-        assert!(done.err.contains(words), "{}", done.err);
+        coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file]).fails(3, &[words]);
     }
 }

@@ -1,4 +1,4 @@
-//! `coflash report bundle`, and what `report.json` says about a failed update.
+//! `coflash more report bundle`, and what `report.json` says about a failed update.
 
 use std::collections::HashSet;
 use std::fs;
@@ -113,7 +113,7 @@ fn a_bundle_has_no_secret_and_no_firmware() {
     for name in ["trace.log", "log.txt"] {
         assert!(firmware.is_in(&fs::read(first.join(name)).unwrap()), "{name}");
     }
-    let words = ["report", "bundle", "-o", "fault.zip", "-N", "5"];
+    let words = ["more", "report", "bundle", "-o", "fault.zip", "-N", "5"];
     let (url, _device) = serve(bootloader());
     let query = format!("{url}?PLANTED-now");
     for bus in [&query, &url] {
@@ -187,7 +187,7 @@ fn a_record_that_begins_within_a_password_does_not_have_it() {
     let done = recorded(&folder, &words, &[]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     let run = runs(&folder).pop().unwrap();
-    let bundle = ["report", "bundle", "reports", "-o", "fault.zip"];
+    let bundle = ["more", "report", "bundle", "reports", "-o", "fault.zip"];
     let done = run_in(&folder, &bundle);
     assert_eq!(done.exit, 0, "{}", done.err);
     let members = members(&folder.path("fault.zip"));
@@ -215,7 +215,7 @@ fn a_bundle_has_what_the_device_says_and_no_values_of_read() {
     assert!(read.exit == 0 && read.out.contains("FIRMWARE"), "{}{}", read.out, read.err);
     let of_run = runs(&folder).pop().unwrap().display().to_string();
     let (url, _device) = serve(bootloader());
-    let words = ["report", "bundle", &of_run, "-N", "5", "--bus", &url, "--json"];
+    let words = ["more", "report", "bundle", &of_run, "-N", "5", "--bus", &url, "--json"];
     let done = run(command().current_dir(folder.path("")).args(words));
     let said: Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!((&said["runs"], &said["answer"]), (&1.into(), &"the device has answered".into()));
@@ -240,11 +240,11 @@ fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
     let folder = folder("bundle-silent");
     let (url, _device) = serve(bootloader());
     let quick = ["--sdo-timeout", "50", "--boot-timeout", "50"];
-    let silent = [&["report", "bundle", "-N", "9", "--bus", &url][..], &quick].concat();
+    let silent = [&["more", "report", "bundle", "-N", "9", "--bus", &url][..], &quick].concat();
     for (words, why) in [
         (silent, "node 9 does not answer"),
-        (vec!["report", "bundle"], "no CAN bus is given"),
-        (vec!["report", "bundle", "--bus", "nonsense:1"], "nonsense"),
+        (vec!["more", "report", "bundle"], "no CAN bus is given"),
+        (vec!["more", "report", "bundle", "--bus", "nonsense:1"], "nonsense"),
     ] {
         let done = run(command().current_dir(folder.path("")).args(&words));
         assert!(done.exit == 0 && done.out.contains(why), "{words:?}: {}{}", done.out, done.err);
@@ -252,11 +252,11 @@ fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
         assert!(json(&members, "device.json")["error"]["what"].as_str().unwrap().contains(why));
         assert!(text(&members, "README.txt").contains(why));
     }
-    let done = run(command().current_dir(folder.path("")).args(["report", "bundle", "none"]));
-    assert!(done.exit == 3 && done.err.contains("none: cannot be read"), "{}", done.err);
+    run(command().current_dir(folder.path("")).args(["more", "report", "bundle", "none"]))
+        .fails(3, &["none: cannot be read"]);
     fs::create_dir(folder.path("empty")).unwrap();
-    let done = run(command().current_dir(folder.path("")).args(["report", "bundle", "empty"]));
-    assert!(done.exit == 2 && done.err.contains("has no recorded run"), "{}", done.err);
+    run(command().current_dir(folder.path("")).args(["more", "report", "bundle", "empty"]))
+        .fails(2, &["has no recorded run"]);
 }
 
 /// A block with a wrong CRC is sent again, and again: the report has each attempt, what the device

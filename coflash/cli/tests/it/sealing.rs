@@ -44,7 +44,7 @@ impl Room {
         let image = raw::read(&program(), Some(START)).unwrap();
         room.0.file("app.hex", ihex::emit(&image).as_bytes());
         for role in ["root", "release", "kek"] {
-            room.good(&["key", "new", "--role", role, "-o", &room.path(&format!("{role}.pem"))]);
+            room.good(&["seal", "keys", "new", "--role", role, "-o", &room.path(&format!("{role}.pem"))]);
         }
         room.certify("release.cert", &[]);
         room
@@ -60,14 +60,13 @@ impl Room {
 
     #[track_caller]
     fn good(&self, words: &[&str]) -> Done {
-        let done = coflash(words);
-        assert_eq!(done.exit, 0, "{words:?}: {}", done.err);
-        done
+        coflash(words).good()
     }
 
     fn certify(&self, name: &str, more: &[&str]) {
         let (root, key, out) = (self.path("root.pem"), self.path("release.pub"), self.path(name));
-        let words = ["key", "certify", "--root", &root, "--key", &key, "--epoch", "3", "--vendor", "0x3F"];
+        let words =
+            ["seal", "keys", "certify", "--root", &root, "--key", &key, "--epoch", "3", "--vendor", "0x3F"];
         self.good(&[&words[..], &["-o", &out], more].concat());
     }
 
@@ -75,12 +74,13 @@ impl Room {
     fn seal(&self, name: &str, more: &[&str]) -> Done {
         let (app, out) = (self.path("app.hex"), self.path(name));
         let (key, cert) = (self.path("release.pem"), self.path("release.cert"));
-        let words = ["seal", &app, "-o", &out, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert];
+        let words =
+            ["seal", "image", &app, "-o", &out, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert];
         coflash(&[&words[..], more].concat())
     }
 
     fn verify(&self, name: &str, more: &[&str]) -> Done {
-        coflash(&[&["verify", &self.path(name), "--root", &self.path("root.pub")], more].concat())
+        coflash(&[&["seal", "verify", &self.path(name), "--root", &self.path("root.pub")], more].concat())
     }
 }
 
@@ -106,18 +106,16 @@ fn keys_are_made_once_and_are_those_of_openssl() {
         use std::os::unix::fs::PermissionsExt as _;
         assert_eq!(fs::metadata(room.path(name)).unwrap().permissions().mode() & 0o777, 0o600, "{name}");
     }
-    let again = coflash(&["key", "new", "--role", "root", "-o", &root]);
-    assert_eq!(again.exit, 2);
-    assert!(again.err.contains("exists already"), "{}", again.err);
+    coflash(&["seal", "keys", "new", "--role", "root", "-o", &root]).fails(2, &["exists already"]);
     assert_eq!(room.bytes("root.pem"), before);
     // Only the public key exists.
     fs::remove_file(&root).unwrap();
-    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &root]).exit, 2);
+    assert_eq!(coflash(&["seal", "keys", "new", "--role", "root", "-o", &root]).exit, 2);
     assert!(!Path::new(&root).exists());
-    room.good(&["key", "new", "--role", "root", "-o", &root, "--force"]);
+    room.good(&["seal", "keys", "new", "--role", "root", "-o", &root, "--force"]);
     assert_ne!(room.bytes("root.pem"), before);
     // With this name both files would have the same path.
-    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &room.path("a.pub")]).exit, 2);
+    assert_eq!(coflash(&["seal", "keys", "new", "--role", "root", "-o", &room.path("a.pub")]).exit, 2);
 
     if let Some(public) = openssl(&["pkey", "-in", &root, "-pubout"]) {
         assert_eq!(public, room.bytes("root.pub"));
@@ -125,11 +123,11 @@ fn keys_are_made_once_and_are_those_of_openssl() {
         openssl(&["genpkey", "-algorithm", "ed25519", "-out", &made]).unwrap();
         let der = openssl(&["pkey", "-in", &made, "-pubout", "-outform", "DER"]).unwrap();
         let digits: String = der[12..].iter().map(|byte| format!("{byte:02x}")).collect();
-        let shown = json(&["key", "show", &made]);
+        let shown = json(&["seal", "keys", "show", &made]);
         assert_eq!((&shown["kind"], &shown["public_key"]), (&"private key".into(), &digits.into()));
         // A key of another curve is no key for coflash.
         openssl(&["genpkey", "-algorithm", "x25519", "-out", &made]).unwrap();
-        assert_eq!(coflash(&["key", "show", &made]).exit, 3);
+        assert_eq!(coflash(&["seal", "keys", "show", &made]).exit, 3);
     }
 }
 
@@ -138,14 +136,14 @@ fn keys_and_certificates_are_shown_without_secrets() {
     let room = Room::new("show-keys");
     let id = PublicKey::from_pem(&String::from_utf8(room.bytes("release.pub")).unwrap()).unwrap().id();
     for (name, kind) in [("release.pem", "private key"), ("release.pub", "public key")] {
-        let shown = json(&["key", "show", &room.path(name)]);
+        let shown = json(&["seal", "keys", "show", &room.path(name)]);
         assert_eq!((&shown["kind"], &shown["id"]), (&kind.into(), &id.into()));
     }
     let kek = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
-    let shown = room.good(&["key", "show", &room.path("kek.pem")]);
+    let shown = room.good(&["seal", "keys", "show", &room.path("kek.pem")]);
     assert_eq!(shown.out, format!("{}: key-encryption key {:08X}h\n", room.path("kek.pem"), kek.id()));
     room.certify("test.cert", &["--role", "test", "--product", "1234", "--lowest", "2", "--highest", "5"]);
-    let shown = json(&["key", "show", &room.path("test.cert")]);
+    let shown = json(&["seal", "keys", "show", &room.path("test.cert")]);
     assert_eq!((&shown["kind"], &shown["role"]), (&"certificate".into(), &"test".into()));
     assert_eq!((&shown["key_id"], &shown["epoch"]), (&id.into(), &3.into()));
     assert_eq!((&shown["lowest"], &shown["highest"]), (&2.into(), &5.into()));
@@ -153,9 +151,10 @@ fn keys_and_certificates_are_shown_without_secrets() {
         [("empty", &b""[..]), ("text", b"hello"), ("cut.cert", b"CBK1\x98"), ("binary", &[0xFF; 99])]
     {
         let file = room.0.file(name, bytes);
-        assert_eq!(coflash(&["key", "show", &file]).exit, 3, "{name}");
+        assert_eq!(coflash(&["seal", "keys", "show", &file]).exit, 3, "{name}");
     }
-    let bad = ["key", "certify", "--root", &room.path("root.pem"), "--key", &room.path("release.pub")];
+    let bad =
+        ["seal", "keys", "certify", "--root", &room.path("root.pem"), "--key", &room.path("release.pub")];
     let bad = [&bad[..], &["--epoch", "1", "--vendor", "1", "--lowest", "6", "--highest", "5"]].concat();
     assert_eq!(coflash(&bad).exit, 2);
 }
@@ -165,16 +164,19 @@ fn keys_and_certificates_are_shown_without_secrets() {
 fn a_value_of_128_bits_makes_a_key() {
     let room = Room::new("value");
     let (value, out) = ("000102030405060708090a0b0c0d0e0f", room.path("product.pem"));
-    room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &out]);
+    room.good(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &out]);
     let text = room.0.file("text", b"coboot key of a value 1\0");
     let option = format!("hexkey:{value}");
     if let Some(mac) = openssl(&["dgst", "-sha512", "-binary", "-mac", "HMAC", "-macopt", &option, &text]) {
         let kek = Kek::new(mac[..32].try_into().unwrap()).unwrap();
-        assert_eq!(json(&["key", "show", &out])["id"], kek.id());
+        assert_eq!(json(&["seal", "keys", "show", &out])["id"], kek.id());
     }
     for (role, value) in [("kek", "0001"), ("kek", "zz"), ("root", value)] {
         let out = room.path("none.pem");
-        assert_eq!(coflash(&["key", "new", "--role", role, "--of-value", value, "-o", &out]).exit, 2);
+        assert_eq!(
+            coflash(&["seal", "keys", "new", "--role", role, "--of-value", value, "-o", &out]).exit,
+            2
+        );
         assert!(!Path::new(&out).exists());
     }
 }
@@ -202,10 +204,10 @@ fn the_converter_encrypts_with_a_value() {
     assert!(done.out.contains("app.blk: program 1 V1.10r100, counter 7, 9001 bytes"), "{}", done.out);
     assert!(done.err.contains("--add has no effect"), "{}", done.err);
     let kek = room.path("product.pem");
-    room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
+    room.good(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
     assert!(room.verify("app.blk", &["--kek", &kek]).out.contains("the program is whole, 9001 bytes"));
     assert!(room.verify("app.blk", &["--kek", &room.path("kek.pem")]).err.contains("for other keys"));
-    let shown = json(&["show", &room.path("app.blk")]);
+    let shown = json(&["seal", "show", &room.path("app.blk")]);
     assert_eq!(shown["flags"], serde_json::json!(["encrypted"]));
     assert_eq!(shown["blocks"]["start"], START);
     // No part of the program is visible.
@@ -226,13 +228,10 @@ fn the_converter_encrypts_with_a_value() {
         (&["--add", "1"], "--key"),
         (&["--key", value, "--crc16"], "--crc16"),
     ] {
-        let done = coflash(&[&["convert", &app], more].concat());
-        assert_eq!(done.exit, 2);
-        assert!(done.err.contains(words), "{}", done.err);
+        coflash(&[&["convert", &app], more].concat()).fails(2, &[words]);
     }
     let junk = room.0.file("junk.bin", &[0x5A; 1000]);
-    let done = coflash(&[&["convert", &junk, "-I", "binary"], &signed[2..]].concat());
-    assert!(done.exit == 3 && done.err.contains("is not a program"), "{}", done.err);
+    coflash(&[&["convert", &junk, "-I", "binary"], &signed[2..]].concat()).fails(3, &["is not a program"]);
     assert!(!Path::new(&room.path("junk.blk")).exists());
 }
 
@@ -287,8 +286,7 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
     for (name, blocks, largest) in
         [("usual.blk", &["--blocks"][..], 0x400), ("small.blk", &["--blocks", "0x110"], 0x110)]
     {
-        let done = room.seal(name, &[&more[..], blocks].concat());
-        assert_eq!(done.exit, 0, "{}", done.err);
+        room.seal(name, &[&more[..], blocks].concat()).good();
         let blocks = split(&room.bytes(name));
         let (control, carried) = unwrapped(&blocks);
         assert!(carried == image);
@@ -299,27 +297,26 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
         // The file counts as the image that is in its blocks.
         let verified = room.verify(name, &["--product", "1234"]);
         assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.err);
-        let shown = json(&["show", &room.path(name)]);
+        let shown = json(&["seal", "show", &room.path(name)]);
         assert_eq!((&shown["format"], &shown["counter"]), (&"sealed image".into(), &7.into()));
         assert_eq!(shown["blocks"]["count"], blocks.len());
         assert_eq!(shown["blocks"]["crc"], crc32(&image));
-        for command in ["show", "inspect"] {
-            let words = room.good(&[command, &room.path(name)]).out;
+        for command in [&["seal", "show"][..], &["inspect"]] {
+            let words = room.good(&[command, &[&room.path(name)]].concat()).out;
             let front =
                 format!("block file, {} blocks, from 0x08010000 on; in it: sealed image", blocks.len());
             assert!(words.contains(&front) && words.contains("counter      7"), "{words}");
         }
-        let converted = coflash(&["convert", &room.path(name), &room.path("x.blk")]);
-        assert!(converted.exit == 3 && converted.err.contains("is a sealed image"), "{}", converted.err);
+        coflash(&["convert", &room.path(name), &room.path("x.blk")]).fails(3, &["is a sealed image"]);
     }
-    assert_eq!(json(&["show", &room.path("app.cbs")])["blocks"], Value::Null);
+    assert_eq!(json(&["seal", "show", &room.path("app.cbs")])["blocks"], Value::Null);
     // The name of the result, and options that do not fit together.
     let (app, key) = (room.path("app.hex"), room.path("release.pem"));
-    let words = ["seal", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
+    let words =
+        ["seal", "image", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
     room.good(&[&words[..], &["--blocks"]].concat());
     assert!(room.bytes("app.blk").len() > image.len());
-    let done = coflash(&[&words[..], &["--blocks", "20"]].concat());
-    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    coflash(&[&words[..], &["--blocks", "20"]].concat()).fails(2, &["a block size of 20 is impossible"]);
     // Every command reports an error in the blocks.
     let good = room.bytes("small.blk");
     let mut wrong = good.clone();
@@ -334,10 +331,10 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
         let file = room.0.file(name, bytes);
         let root = room.path("root.pub");
         for command in [
-            &["show", &file][..],
+            &["seal", "show", &file][..],
             &["inspect", &file],
-            &["verify", &file, "--root", &root],
-            &["verify-device", &file, "--root", &root],
+            &["seal", "verify", &file, "--root", &root],
+            &["seal", "verify-device", &file, "--root", &root],
             &["flash", &file],
         ] {
             let done = coflash(command);
@@ -350,32 +347,28 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
 #[test]
 fn a_program_is_sealed_shown_and_verified() {
     let room = Room::new("seal");
-    let done = room.seal("app.cbs", &["--counter", "7"]);
-    assert_eq!(done.exit, 0, "{}", done.err);
-    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&program());
+    let done = room.seal("app.cbs", &["--counter", "7"]).good();
+    let crc = crc32(&program());
     let expected = format!(": program 1 V1.10r100, counter 7, 9001 bytes, CRC {crc:08X}h\n");
     assert!(done.out.ends_with(&expected), "{}", done.out);
     let first = room.bytes("app.cbs");
     room.seal("app.cbs", &["--counter", "7"]);
     assert_eq!(room.bytes("app.cbs"), first, "the same input, the same file");
 
-    let shown = json(&["show", &room.path("app.cbs")]);
+    let shown = json(&["seal", "show", &room.path("app.cbs")]);
     assert_eq!((&shown["vendor_id"], &shown["product_code"]), (&VENDOR.into(), &PRODUCT.into()));
     assert_eq!((&shown["version_text"], &shown["counter"]), (&"V1.10r100".into(), &7.into()));
     assert_eq!(
         (&shown["size"], &shown["payload"], &shown["chunk"]),
         (&9001.into(), &9001.into(), &4096.into())
     );
-    let words = room.good(&["show", &room.path("app.cbs")]).out;
+    let words = room.good(&["seal", "show", &room.path("app.cbs")]).out;
     assert!(words.contains("vendor-ID 0000003Fh, product code 000004D2h"), "{words}");
     // `inspect` recognises it, too, and no other command takes it for another format.
     assert_eq!(room.good(&["inspect", &room.path("app.cbs")]).out, words);
-    let converted = coflash(&["convert", &room.path("app.cbs"), &room.path("x.blk")]);
-    assert_eq!(converted.exit, 3);
-    assert!(converted.err.contains("is a sealed image"), "{}", converted.err);
+    coflash(&["convert", &room.path("app.cbs"), &room.path("x.blk")]).fails(3, &["is a sealed image"]);
 
-    let verified = room.verify("app.cbs", &["--product", "1234", "--counter", "7", "--epoch", "3"]);
-    assert_eq!(verified.exit, 0, "{}", verified.err);
+    let verified = room.verify("app.cbs", &["--product", "1234", "--counter", "7", "--epoch", "3"]).good();
     assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.out);
     for (more, words, number) in [
         (&["--product", "1"][..], "it is for product code 000004D2h", "0x60000182"),
@@ -393,15 +386,17 @@ fn a_program_is_sealed_shown_and_verified() {
     let mut damaged = first.clone();
     *damaged.last_mut().unwrap() ^= 1;
     let file = room.0.file("damaged.cbs", &damaged);
-    let done = coflash(&["verify", &file, "--root", &room.path("root.pub")]);
+    let done = coflash(&["seal", "verify", &file, "--root", &room.path("root.pub")]);
     assert!(done.err.contains("chunk 3 of 3") && done.err.contains("[0x6000018a]"), "{}", done.err);
-    let done = coflash(&["verify", &room.path("app.cbs"), "--root", &room.path("release.pub")]);
+    let done = coflash(&["seal", "verify", &room.path("app.cbs"), "--root", &room.path("release.pub")]);
     assert!(done.err.contains("is not one of the given roots [0x6000018e]"), "{}", done.err);
     for (name, bytes) in [("empty.cbs", &b""[..]), ("cut.cbs", &first[..600]), ("magic.cbs", b"CBS1")] {
         let file = room.0.file(name, bytes);
-        for words in
-            [&["show", &file][..], &["verify", &file, "--root", &room.path("root.pub")], &["inspect", &file]]
-        {
+        for words in [
+            &["seal", "show", &file][..],
+            &["seal", "verify", &file, "--root", &room.path("root.pub")],
+            &["inspect", &file],
+        ] {
             assert_eq!(coflash(words).exit, 3, "{words:?}");
         }
     }
@@ -414,7 +409,7 @@ fn encrypted_and_compressed_programs_come_out_again() {
     let sealed =
         room.seal("app.cbs", &["--counter", "0", "--compress", "--encrypt", &kek, "--text", "for all"]);
     assert!(sealed.out.contains(", compressed to "), "{}{}", sealed.out, sealed.err);
-    let shown = json(&["show", &room.path("app.cbs")]);
+    let shown = json(&["seal", "show", &room.path("app.cbs")]);
     assert_eq!(shown["flags"], serde_json::json!(["encrypted", "compressed"]));
     assert_eq!(shown["text"], "for all");
     assert!(shown["payload"].as_u64() < shown["size"].as_u64());
@@ -431,9 +426,8 @@ fn encrypted_and_compressed_programs_come_out_again() {
     let (uid, sbom) = ("00112233445566778899aabb", room.0.file("sbom.json", b"{}"));
     let more = ["--counter", "0x10", "--base", &old, "--device", uid, "--hardware", "1", "--hardware", "33"];
     let more = [&more[..], &["--chunk", "512", "--sbom", &sbom, "--date", "1420070400", "-P", "1"]].concat();
-    let sealed = room.seal("app.cbs", &more);
-    assert_eq!(sealed.exit, 0, "{}", sealed.err);
-    let shown = json(&["show", &room.path("app.cbs")]);
+    room.seal("app.cbs", &more).good();
+    let shown = json(&["seal", "show", &room.path("app.cbs")]);
     assert_eq!((&shown["unique_id"], &shown["hardware"]), (&uid.into(), &2.into()));
     assert_eq!((&shown["chunk"], &shown["created"]), (&512.into(), &1_420_070_400.into()));
     // A hash of two bytes: `printf '{}' | openssl dgst -sha512-256`.
@@ -468,15 +462,14 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
         (&["--counter", "1", "-P", "2"], 2, "has no program 2"),
         (&[], 2, "--counter"),
     ] {
-        let done = room.seal("none.cbs", more);
-        assert_eq!(done.exit, exit, "{more:?}: {}", done.err);
-        assert!(done.err.contains(words), "{}", done.err);
+        room.seal("none.cbs", more).fails(exit, &[words]);
         assert!(!Path::new(&room.path("none.cbs")).exists());
     }
     // No program, and no label.
     let junk = room.0.file("junk.bin", &[0x5A; 1000]);
     let key = room.path("release.pem");
-    let words = ["seal", &junk, "-I", "binary", "--board", "nucleo-f446re", "--key", &key, "--counter", "1"];
+    let words =
+        ["seal", "image", &junk, "-I", "binary", "--board", "nucleo-f446re", "--key", &key, "--counter", "1"];
     assert!(coflash(&words).err.contains("is not a program"));
     let done = coflash(&[&words[..], &["--data"]].concat());
     assert!(
@@ -485,12 +478,11 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
         "{}",
         done.err
     );
-    let done = coflash(&[&words[..], &["--data", "--vendor", "1", "--product", "2"]].concat());
-    assert_eq!(done.exit, 0, "{}", done.err);
-    assert_eq!(json(&["show", &room.path("junk.cbs")])["flags"], serde_json::json!(["data"]));
+    coflash(&[&words[..], &["--data", "--vendor", "1", "--product", "2"]].concat()).good();
+    assert_eq!(json(&["seal", "show", &room.path("junk.cbs")])["flags"], serde_json::json!(["data"]));
     // A sealed image is not sealed again, and not overwritten.
     let before = room.bytes("junk.cbs");
-    let done = coflash(&["seal", &room.path("junk.cbs"), "--key", &key, "--counter", "1"]);
+    let done = coflash(&["seal", "image", &room.path("junk.cbs"), "--key", &key, "--counter", "1"]);
     assert_eq!((done.exit, room.bytes("junk.cbs")), (2, before));
 }
 
@@ -499,17 +491,17 @@ fn a_module_signs_in_two_steps() {
     let room = Room::new("module");
     let (app, out) = (room.path("app.hex"), room.path("app.cbs"));
     let (key, cert, tbs) = (room.path("release.pub"), room.path("release.cert"), room.path("app.tbs"));
-    let words = ["seal", &app, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert, "--counter", "1"];
+    let words =
+        ["seal", "image", &app, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert, "--counter", "1"];
     let done = room.good(&[&words[..], &["--tbs", &tbs]].concat());
     assert!(done.out.contains("its signature is missing"), "{}", done.out);
     let done = room.verify("app.cbs", &[]);
     assert!(done.err.contains("its signature is wrong"), "{}", done.err);
     let wrong = room.0.file("wrong.sig", &[0; 64]);
-    let done = coflash(&["seal", &out, "--key", &key, "--attach", &wrong]);
-    assert_eq!(done.exit, 3);
-    assert!(done.err.contains("this is not a signature of the key"), "{}", done.err);
+    coflash(&["seal", "image", &out, "--key", &key, "--attach", &wrong])
+        .fails(3, &["this is not a signature of the key"]);
     let short = room.0.file("short.sig", &[0; 63]);
-    assert!(coflash(&["seal", &out, "--key", &key, "--attach", &short]).err.contains("64 bytes"));
+    assert!(coflash(&["seal", "image", &out, "--key", &key, "--attach", &short]).err.contains("64 bytes"));
 
     let signature = room.path("app.sig");
     let private = room.path("release.pem");
@@ -520,9 +512,8 @@ fn a_module_signs_in_two_steps() {
         fs::write(&signature, key.sign(&room.bytes("app.tbs"))).unwrap();
     }
     // In blocks, if their addresses are known.
-    let attach = ["seal", &out, "--key", &key, "--attach", &signature];
-    let done = coflash(&[&attach[..], &["--blocks"]].concat());
-    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
+    let attach = ["seal", "image", &out, "--key", &key, "--attach", &signature];
+    coflash(&[&attach[..], &["--blocks"]].concat()).fails(2, &["give --board"]);
     room.good(&[&attach[..], &["--blocks", "--board", "nucleo-f446re"]].concat());
     room.good(&attach);
     assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
@@ -563,10 +554,11 @@ fn a_bootloader_gets_its_keys() {
     let bootloader = bootloader(b"CBS1");
     let boot = room.0.file("boot.hex", bootloader.as_bytes());
     let (root, kek) = (room.path("root.pub"), room.path("kek.pem"));
-    let words = ["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek];
+    let words = ["seal", "provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek];
+    let provision = |more: &[&str]| coflash(&[&words[..], more].concat());
     let more = ["--counter", "7", "--epoch", "2", "--for-tests"];
     let out = room.path("production.hex");
-    let done = room.good(&[&words[..], &more, &["-o", &out]].concat());
+    let done = provision(&[&more[..], &["-o", &out]].concat()).good();
     let secret = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
     assert!(done.out.contains(&format!("key-encryption keys  {:08X}h", secret.id())), "{}", done.out);
     let image = ihex::read(&room.bytes("production.hex")).unwrap();
@@ -590,33 +582,17 @@ fn a_bootloader_gets_its_keys() {
         (&["-o", &room.path("x.hex"), "--root", &root], 2, "a key was given twice"),
         (&["-o", &room.path("x.hex"), "--kek", &kek], 2, "a key was given twice"),
     ] {
-        let done = coflash(
-            &[&["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek], more]
-                .concat(),
-        );
-        assert_eq!(done.exit, exit, "{more:?}: {}", done.err);
-        assert!(done.err.contains(words), "{}", done.err);
+        provision(more).fails(exit, &[words]);
     }
-    let again = coflash(&[
-        "provision",
-        &out,
-        "--board",
-        "stm32f407g-disc1",
-        "--root",
-        &root,
-        "-o",
-        &room.path("y.hex"),
-    ]);
-    assert_eq!(again.exit, 3);
-    assert!(again.err.contains("the place of the keys"), "{}", again.err);
+    coflash(&[&["seal", "provision", &out, "-o", &room.path("y.hex")][..], &words_of(&root)].concat())
+        .fails(3, &["the place of the keys"]);
     // For any other file keys have no meaning.
     let other = room.0.file("other.hex", self::bootloader(b"CBS2").as_bytes());
     let out = room.path("none.hex");
-    let done = coflash(&[&["provision", &other][..], &words_of(&root), &["-o", &out]].concat());
-    assert!(done.exit == 3 && done.err.contains("support for sealed images"), "{}", done.err);
+    coflash(&[&["seal", "provision", &other][..], &words_of(&root), &["-o", &out]].concat())
+        .fails(3, &["support for sealed images"]);
     assert!(!Path::new(&out).exists());
-    let done = coflash(&["provision", &boot, "--root", &root]);
-    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
+    coflash(&["seal", "provision", &boot, "--root", &root]).fails(2, &["give --board"]);
 }
 
 /// Flashes this file; returns the output, the data for the device, and the other writes.
@@ -654,14 +630,14 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
 
     // The results that the device reports.
     for (status, number, words, advice) in [
-        (0x8A, "[0x6000018a]", "the program's signature is wrong", "coflash verify"),
+        (0x8A, "[0x6000018a]", "the program's signature is wrong", "coflash seal verify"),
         (
             0x8C,
             "[0x6000018c]",
             "its counter or the epoch of its key is too low for the device",
             "coflash info",
         ),
-        (0x8E, "[0x6000018e]", "the device has no key for this program", "coflash show"),
+        (0x8E, "[0x6000018e]", "the device has no key for this program", "coflash seal show"),
     ] {
         let (done, kept, _) = flashed(&file, 0x10000, status, &[]);
         assert_eq!(done.exit, 6, "{}", done.out);
@@ -685,16 +661,14 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
     assert!(second.err.contains("it is for program 1, and program 2 is to be written"), "{}", second.err);
     assert_eq!(second.exit, 3);
     let cut = room.0.file("cut.cbs", &bytes[..bytes.len() - 1]);
-    let cut = coflash(&["flash", &cut]);
-    assert!(cut.exit == 3 && cut.err.contains("it is cut off"), "{}", cut.err);
+    coflash(&["flash", &cut]).fails(3, &["it is cut off"]);
     // In the bootloader already, and in the other dialects of the same objects.
     for dialect in ["raw", "hex"] {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
         let mut fake = Fake::new(BOOTLOADER);
         fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room: 0x10000, status: 0 }));
         let (bus, server) = serve(fake);
-        let done = coflash(&["flash", &file, "--bus", &bus, "-N", "5", "--dialect", dialect]);
-        assert_eq!(done.exit, 0, "{}", done.err);
+        coflash(&["flash", &file, "--bus", &bus, "-N", "5", "--dialect", dialect]).good();
         server.join().unwrap();
         assert!(*kept.lock().unwrap() == bytes);
     }
@@ -744,13 +718,13 @@ fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
 fn what_the_bootloader_alone_has_is_said_with_the_way_there() {
     let room = Room::new("way");
     let root = room.path("root.pem");
-    for words in [&["events"][..], &["unlock", "erase", "--root", &root]] {
+    for words in [&["seal", "events"][..], &["seal", "unlock", "erase", "--root", &root]] {
         let (done, fake) = on(APPLICATION, Told::sealed(&program()), words);
         assert_eq!((done.exit, fake.writes().len()), (6, 0), "{}", done.err);
         assert!(done.err.contains("coflash enter"), "{words:?}: {}", done.err);
         // In the bootloader of a product without sealed images, too, it is the object that is missing.
         let (done, _) = on(BOOTLOADER, Told { bootloader: Vec::new(), application: Vec::new() }, words);
-        assert!(done.exit == 6 && done.err.contains("without support for sealed images"), "{}", done.err);
+        done.fails(6, &["without support for sealed images"]);
     }
 }
 
@@ -762,7 +736,7 @@ fn a_refusal_for_want_of_a_right_names_the_right() {
     let app = room.path("app.hex");
     for (command, words) in [
         (0x03, &["erase"][..]),
-        (0x84, &["withdraw"]),
+        (0x84, &["more", "withdraw"]),
         (0x03, &["flash", &app, "--force", "--board", "nucleo-f446re"]),
     ] {
         let mut fake = Fake::new(BOOTLOADER);
@@ -774,8 +748,8 @@ fn a_refusal_for_want_of_a_right_names_the_right() {
         let (bus, server) = serve(fake);
         let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
         server.join().unwrap();
-        assert!(done.exit == 6 && done.err.contains("[0x60000184]"), "{words:?}: {}", done.err);
-        for way in ["coflash info", "coflash seal", "coflash unlock"] {
+        done.fails(6, &["[0x60000184]"]);
+        for way in ["coflash info", "coflash seal image", "coflash seal unlock"] {
             assert!(done.err.contains(way), "{words:?}, {way}: {}", done.err);
         }
     }
@@ -874,16 +848,16 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     assert!(kept == image);
 
     let file = room.path("app.cbs");
-    let done = coflash(&["flash", &file, "--blocks", "--block-size", "20"]);
-    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    coflash(&["flash", &file, "--blocks", "--block-size", "20"])
+        .fails(2, &["a block size of 20 is impossible"]);
     // A device that does not report its program's start, and one that does not accept blocks.
     let untold = Told::sealed(program).but(((0x2004, 1), Vec::new()));
     let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
-    assert!(done.exit == 6 && done.err.contains("the start of its program (2004h)"), "{}", done.err);
+    done.fails(6, &["the start of its program (2004h)"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     let words = ["flash", &file, "--blocks", "--dialect", "raw"];
     let (done, fake) = on(BOOTLOADER, Told::sealed(program), &words);
-    assert!(done.exit == 2 && done.err.contains("not in blocks"), "{}", done.err);
+    done.fails(2, &["not in blocks"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
 }
 
@@ -896,7 +870,7 @@ fn a_device_without_keys_gets_no_sealed_image() {
     let (done, fake) = on(BOOTLOADER, open(), &["flash", &file]);
     assert_eq!(done.exit, 6);
     assert!(
-        done.err.contains("the device is not sealed") && done.err.contains("coflash provision"),
+        done.err.contains("the device is not sealed") && done.err.contains("coflash seal provision"),
         "{}",
         done.err
     );
@@ -904,38 +878,93 @@ fn a_device_without_keys_gets_no_sealed_image() {
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     // An application does not report it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
-    assert!(done.exit == 6 && done.err.contains("the device is not sealed"), "{}", done.err);
+    done.fails(6, &["the device is not sealed"]);
     assert!(done.err.contains("its application is running; it was not changed"), "{}", done.err);
     assert_eq!(fake.writes(), ["command 80", "command 01"]);
 }
 
+/// A sealed image for one device, to compare devices with.
+struct Comparison {
+    room: Room,
+    file: String,
+}
+
+impl Comparison {
+    fn new(test: &str) -> Self {
+        let room = Room::new(test);
+        room.seal("app.cbs", &["--counter", "7", "--device", "00112233445566778899aabb", "--hardware", "1"]);
+        Self { file: room.path("app.cbs"), room }
+    }
+
+    /// The words of the command.
+    fn words<'a>(&'a self, root: &'a str) -> [&'a str; 5] {
+        ["seal", "verify-device", &self.file, "--root", root]
+    }
+
+    fn of(&self, running: u32, told: Told, more: &[&str]) -> (Done, Fake) {
+        on(running, told, &[&self.words(&self.room.path("root.pub"))[..], more].concat())
+    }
+
+    /// The exit code and the JSON of a device in its bootloader.
+    fn json(&self, told: Told) -> (i32, Value) {
+        let (done, _) = self.of(BOOTLOADER, told, &["--json"]);
+        (done.exit, serde_json::from_str(&done.out).unwrap())
+    }
+}
+
+fn number(index: u16, sub: u8, value: u32) -> ((u16, u8), Vec<u8>) {
+    ((index, sub), value.to_le_bytes().to_vec())
+}
+
+/// The device that the image is for, in its bootloader.
+fn same_device() -> Told {
+    Told::sealed(&program()).but(number(0x1018, 3, 0x0001_0021))
+}
+
+/// The same device, whose bootloader can be renewed and has this state of a renewal (docs/renewal.md).
+fn renewable(state: [u8; 4]) -> Told {
+    let factory = number(0x2007, 6, 0x0FFF_AAED);
+    same_device().but(((0x2007, 1), vec![2])).but(factory).but(((0x2007, 9), state.to_vec()))
+}
+
 #[test]
 fn a_device_is_compared_with_a_sealed_image() {
-    let room = Room::new("verify-device");
-    let program = program();
-    room.seal("app.cbs", &["--counter", "7", "--device", "00112233445566778899aabb", "--hardware", "1"]);
-    let (file, root) = (room.path("app.cbs"), room.path("root.pub"));
-    let words = ["verify-device", &file, "--root", &root];
-    let compared = |running: u32, told: Told, more: &[&str]| on(running, told, &[&words[..], more].concat());
-
-    let revision = ((0x1018, 3), 0x0001_0021_u32.to_le_bytes().to_vec());
-    let (done, fake) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()), &[]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let comparison = Comparison::new("verify-device");
+    let (done, fake) = comparison.of(BOOTLOADER, same_device(), &[]);
+    let done = done.good();
     assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
     assert!(done.out.contains("and does not run it"), "{}", done.out);
     assert!(done.out.ends_with("not reported 2007h/6, 2007h/1\n"), "{}", done.out);
     assert!(fake.writes().is_empty());
 
     // An application does not report all values, and the command says so.
-    let (done, _) = compared(APPLICATION, Told::sealed(&program), &["--json"]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
-    let value: Value = serde_json::from_str(&done.out).unwrap();
+    let (done, _) = comparison.of(APPLICATION, Told::sealed(&program()), &["--json"]);
+    let value: Value = serde_json::from_str(&done.good().out).unwrap();
     assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
     let untold = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
     assert_eq!(value["untold"], untold);
 
-    // Each difference is named, and each alone is enough.
-    let number = |index: u16, sub: u8, value: u32| ((index, sub), value.to_le_bytes().to_vec());
+    // A program of which no installation is among the last eight events, and one of another number.
+    let forgotten = same_device().but(event(2, [0; 4])).but(event(3, [7, 0x1_0002, 1, 1]));
+    let done = comparison.of(BOOTLOADER, forgotten, &[]).0.good();
+    assert!(done.out.contains("not reported 2003h/1"), "{}", done.out);
+
+    // A bad file is refused before a device is asked. For a missing device there is another code.
+    let (root, other) = (comparison.room.path("root.pub"), comparison.room.path("release.pub"));
+    coflash(&[&comparison.words(&other)[..], &["--bus", "socketcand://127.0.0.1:1/can0"]].concat())
+        .fails(3, &["is not one of the given roots"]);
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.running = None;
+    let (bus, server) = serve(fake);
+    let quick = ["--bus", &bus, "-N", "5", "--sdo-timeout", "20"];
+    coflash(&[&comparison.words(&root)[..], &quick].concat()).fails(5, &[]);
+    server.join().unwrap();
+}
+
+/// Each difference is named, and each alone is enough.
+#[test]
+fn each_difference_from_a_sealed_image_is_named() {
+    let comparison = Comparison::new("differences");
     let other_chip = ((0x2002, 1), [&[1; 12][..], &[0; 32], &SEALED.to_le_bytes()].concat());
     for (told, words) in [
         (number(0x1018, 1, 0x40), "vendor-ID (1018h/1): the file has 0000003Fh, the device 00000040h"),
@@ -959,31 +988,26 @@ fn a_device_is_compared_with_a_sealed_image() {
             "version of the last installation (2003h): the file has V1.10r100, the device V1.0r0",
         ),
     ] {
-        let (done, _) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()).but(told), &[]);
-        assert_eq!(done.exit, 3, "{words}: {}", done.out);
+        let (done, _) = comparison.of(BOOTLOADER, same_device().but(told), &[]);
+        done.fails(3, &["node 5 differs from the file in one property"]);
         assert!(done.out.contains(words), "{words}: {}", done.out);
         assert_eq!(done.out.matches("  differs ").count(), 1, "{}", done.out);
-        assert!(done.err.contains("node 5 differs from the file in one property"), "{}", done.err);
     }
-    let two = Told::sealed(&program).but(number(0x1018, 3, 1)).but(number(0x1F56, 1, 1)).but(challenge(0));
-    let (done, _) = compared(BOOTLOADER, two, &["--json"]);
-    let value: Value = serde_json::from_str(&done.out).unwrap();
+    let two = Told::sealed(&program()).but(number(0x1018, 3, 1)).but(number(0x1F56, 1, 1)).but(challenge(0));
+    let (exit, value) = comparison.json(two);
     let what: Vec<&Value> =
         value["differences"].as_array().unwrap().iter().map(|difference| &difference["what"]).collect();
-    assert_eq!((done.exit, what), (3, vec![&"crc".into(), &"keys".into()]));
+    assert_eq!((exit, what), (3, vec![&"crc".into(), &"keys".into()]));
     assert_eq!(value["same"], false);
+    // A difference comes first: the device may be another one.
+    let (done, _) = comparison.of(BOOTLOADER, renewable([1, 1, 0, 0]).but(number(0x1F56, 1, 1)), &[]);
+    assert!(done.exit == 3 && done.out.contains("  not ready "), "{}{}", done.out, done.err);
+}
 
-    // A program of which no installation is among the last eight events, and one of another number.
-    let forgotten = Told::sealed(&program).but(revision.clone()).but(event(2, [0; 4]));
-    let forgotten = forgotten.but(event(3, [7, 0x1_0002, 1, 1]));
-    let (done, _) = compared(BOOTLOADER, forgotten, &[]);
-    assert!(done.exit == 0 && done.out.contains("not reported 2003h/1"), "{}{}", done.out, done.err);
-
-    // Nor may it be in the middle of a renewal, or have option bytes that no product has.
-    let byte = |sub: u8, value: u8| ((0x2007, sub), vec![value]);
-    let state = |bytes: [u8; 4]| ((0x2007, 9), bytes.to_vec());
-    let factory = number(0x2007, 6, 0x0FFF_AAED);
-    let renewable = || Told::sealed(&program).but(revision.clone()).but(byte(1, 2)).but(factory.clone());
+/// A device may neither be in the middle of a renewal nor have option bytes that no product has.
+#[test]
+fn a_device_that_is_not_ready_fails_the_comparison() {
+    let comparison = Comparison::new("ready");
     for (bytes, fault, words) in [
         // State, origin, end of the last trial and its detail (docs/renewal.md).
         ([1, 0, 0, 0], "staged", "another bootloader waits for its trial: coflash flash with its file"),
@@ -995,57 +1019,35 @@ fn a_device_is_compared_with_a_sealed_image() {
         ([2, 2, 0, 0], "confirmed", "completes the renewal"),
         ([3, 3, 0, 0], "damaged", "is damaged, and the spare runs, which repairs it: switch the device off"),
     ] {
-        let (done, fake) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
-        assert!(done.out.contains("holds program 1 of"), "{}", done.out);
-        assert_eq!((done.exit, done.out.matches("  not ready ").count()), (6, 1), "{bytes:?}: {}", done.out);
-        assert!(done.out.contains(words), "{words}: {}", done.out);
-        assert!(done.err.contains("node 5 is not ready"), "{}", done.err);
+        let (done, fake) = comparison.of(BOOTLOADER, renewable(bytes), &[]);
+        done.fails(6, &["node 5 is not ready"]);
+        assert!(done.out.contains("holds program 1 of") && done.out.contains(words), "{words}: {}", done.out);
+        assert_eq!(done.out.matches("  not ready ").count(), 1, "{bytes:?}: {}", done.out);
         assert!(fake.writes().is_empty());
-        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &["--json"]);
-        let value: Value = serde_json::from_str(&done.out).unwrap();
+        let (_, value) = comparison.json(renewable(bytes));
         let expected = serde_json::json!([true, false, [fault]]);
         assert_eq!(serde_json::json!([value["same"], value["ready"], value["faults"]]), expected);
     }
     // At rest: nothing was ever renewed; installed, and loaded from home or, until the next reset, from
     // staging; a trial that failed, and whose image a program has replaced.
     for bytes in [[0; 4], [3, 0, 0, 0], [3, 1, 0, 0], [3, 2, 0, 0], [0, 0, 1, 0]] {
-        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
-        assert_eq!(done.exit, 0, "{bytes:?}: {}{}", done.out, done.err);
+        comparison.of(BOOTLOADER, renewable(bytes), &[]).0.good();
     }
+    // A state of a later version is none that is known to be good.
+    let done = comparison.of(BOOTLOADER, renewable([4, 0, 0, 0]), &[]).0.good();
+    assert!(done.out.contains("not reported 2007h/9"), "{}", done.out);
     // RM0090 section 3.9.10: SPRMOD is bit 31 of FLASH_OPTCR, BFB2 bit 4, nWRP bits 16 to 27.
     for (option_bytes, fault) in [(0x8001_AAED, "read_protection"), (0x0FFE_AAFD, "second_bank")] {
-        let told = renewable().but(state([0; 4])).but(number(0x2007, 6, option_bytes));
-        let (done, _) = compared(BOOTLOADER, told, &["--json"]);
-        let value: Value = serde_json::from_str(&done.out).unwrap();
-        assert_eq!((done.exit, &value["faults"]), (6, &serde_json::json!([fault])));
+        let (exit, value) = comparison.json(renewable([0; 4]).but(number(0x2007, 6, option_bytes)));
+        assert_eq!((exit, &value["faults"]), (6, &serde_json::json!([fault])));
     }
     // The protection that it has, and the one that belongs to its product.
-    for (number_of_its_own, wanted) in [(2, "it needs sector 0 and no others"), (0, "(0 and 4 on the boards")]
-    {
-        let told = renewable().but(byte(1, number_of_its_own)).but(state([0; 4]));
-        let (done, _) = compared(BOOTLOADER, told.but(number(0x2007, 6, 0x0FEE_AAED)), &[]);
-        assert_eq!(done.exit, 0, "{}", done.err);
+    for (renewal, wanted) in [(2, "it needs sector 0 and no others"), (0, "(0 and 4 on the boards")] {
+        let told = renewable([0; 4]).but(((0x2007, 1), vec![renewal])).but(number(0x2007, 6, 0x0FEE_AAED));
+        let done = comparison.of(BOOTLOADER, told, &[]).0.good();
         let line = "  protection   the device has sectors 0, 4; ";
         assert!(done.out.contains(line) && done.out.contains(wanted), "{}", done.out);
     }
-    // A state of a later version is none that is known to be good.
-    let (done, _) = compared(BOOTLOADER, renewable().but(state([4, 0, 0, 0])), &[]);
-    assert!(done.exit == 0 && done.out.contains("not reported 2007h/9"), "{}{}", done.out, done.err);
-    // A difference comes first: the device may be another one.
-    let other = renewable().but(state([1, 1, 0, 0])).but(number(0x1F56, 1, 1));
-    let (done, _) = compared(BOOTLOADER, other, &[]);
-    assert!(done.exit == 3 && done.out.contains("  not ready "), "{}{}", done.out, done.err);
-
-    // A bad file is refused before a device is asked. For a missing device there is another code.
-    let other = room.path("release.pub");
-    let done = coflash(&["verify-device", &file, "--root", &other, "--bus", "socketcand://127.0.0.1:1/can0"]);
-    assert!(done.exit == 3 && done.err.contains("is not one of the given roots"), "{}", done.err);
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.running = None;
-    let (bus, server) = serve(fake);
-    let done = coflash(&[&words[..], &["--bus", &bus, "-N", "5", "--sdo-timeout", "20"]].concat());
-    assert_eq!(done.exit, 5, "{}", done.err);
-    server.join().unwrap();
 }
 
 /// The library's own check of the results of the commands.
@@ -1065,7 +1067,7 @@ fn ram_image(counter: u32) -> Vec<u8> {
     let words = [0, 64, 4096, 0x2000_0000, 0x2001_FFC0, 1, 1, 7, 0x3F, 0x40, 0, 0x0001_0002, counter, 0, 0];
     image.extend(words.into_iter().flat_map(u32::to_le_bytes));
     image.extend((0..4096_u32).map(|at| at as u8));
-    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image[8..]);
+    let crc = crc32(&image[8..]);
     image[4..8].copy_from_slice(&crc.to_le_bytes());
     image
 }
@@ -1077,22 +1079,23 @@ fn a_bootloader_is_sealed_by_a_key_for_bootloaders() {
     let (root, key) = (room.path("root.pem"), room.path("release.pem"));
     let file = room.0.file("boot.bin", &ram_image(3));
     let (out, cert) = (room.path("boot.cbs"), room.path("boot.cert"));
-    let certify = ["key", "certify", "--root", &root, "--key", &room.path("release.pub"), "--epoch", "1"];
+    let certify =
+        ["seal", "keys", "certify", "--root", &root, "--key", &room.path("release.pub"), "--epoch", "1"];
     let certify = [&certify[..], &["--vendor", "0x3F", "-o", &cert]].concat();
-    let seal = ["seal", &file, "-o", &out, "--bootloader", "--key", &key, "--cert", &cert];
+    let seal = ["seal", "image", &file, "-o", &out, "--bootloader", "--key", &key, "--cert", &cert];
     room.good(&[&certify[..], &["--role", "release"]].concat());
     let done = coflash(&seal);
     assert_eq!(done.exit, 3, "a key for programs: {}", done.err);
     fs::remove_file(&cert).unwrap();
     room.good(&[&certify[..], &["--role", "bootloader"]].concat());
-    assert_eq!(json(&["key", "show", &cert])["role"], "bootloader");
+    assert_eq!(json(&["seal", "keys", "show", &cert])["role"], "bootloader");
     let done = room.good(&seal);
     assert!(done.out.contains("counter 3, 4160 bytes"), "{}", done.out);
-    let shown = json(&["show", &out]);
+    let shown = json(&["seal", "show", &out]);
     assert_eq!((&shown["program"], &shown["counter"]), (&255.into(), &3.into()));
     assert!(room.verify("boot.cbs", &[]).out.contains("4160 bytes"));
     // A key for bootloaders signs no program.
-    let program = ["seal", &room.path("app.hex"), "--board", "nucleo-f446re", "--counter", "7"];
+    let program = ["seal", "image", &room.path("app.hex"), "--board", "nucleo-f446re", "--counter", "7"];
     let done =
         coflash(&[&program[..], &["--key", &key, "--cert", &cert, "-o", &room.path("app.cbs")]].concat());
     assert_eq!(done.exit, 3, "{}", done.err);
@@ -1101,5 +1104,5 @@ fn a_bootloader_is_sealed_by_a_key_for_bootloaders() {
         assert_eq!(coflash(&[&seal[..], &more].concat()).exit, 2, "{more:?}");
     }
     let none = room.path("app.hex");
-    assert_eq!(coflash(&["seal", &none, "--bootloader", "--key", &key, "-o", &out]).exit, 3);
+    assert_eq!(coflash(&["seal", "image", &none, "--bootloader", "--key", &key, "-o", &out]).exit, 3);
 }

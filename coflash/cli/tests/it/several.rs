@@ -74,8 +74,7 @@ fn a_job_file_says_who_gets_what() {
     );
     let (url, server) =
         serve(Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]));
-    let done = coflash(&["--bus", &url, "flash", "--job", &job, "--at-once", "2"]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let done = coflash(&["--bus", &url, "flash", "--job", &job, "--at-once", "2"]).good();
     let bus = server.join().unwrap();
     let plain = fs::read(data("plain-400.blk")).unwrap();
     assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
@@ -88,17 +87,12 @@ fn a_job_file_says_who_gets_what() {
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
     // With an invalid image, no device is changed.
     fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
-    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
-    assert!(
-        done.exit == 3 && done.err.contains("small.hex: is not a program: it does not begin"),
-        "{}",
-        done.err
-    );
+    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job])
+        .fails(3, &["small.hex: is not a program: it does not begin"]);
     fs::write(small, b"hello").unwrap();
-    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
-    assert!(done.exit == 3 && done.err.contains("small.hex: is not a firmware file"), "{}", done.err);
-    let done = coflash(&["flash", "--job", &job, "--node", "5"]);
-    assert!(done.exit == 2 && done.err.contains("cannot be used with"), "{}", done.err);
+    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job])
+        .fails(3, &["small.hex: is not a firmware file"]);
+    coflash(&["flash", "--job", &job, "--node", "5"]).fails(2, &["cannot be used with"]);
 }
 
 /// A device without node-ID (CiA 305) that is a bootloader as soon as it has one.
@@ -177,15 +171,13 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
         folder.file("job.toml", text.as_bytes())
     };
     let (url, server) = serve(unconfigured());
-    let done = coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 4)]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 4)]).good();
     let bus = server.join().unwrap();
     assert_eq!((bus.fake.node, bus.fake.blocks.concat()), (9, fs::read(&file).unwrap()));
     // The manual's options (table 9).
     let (url, server) = serve(unconfigured());
     let legacy = ["--ser_num", "4", "--rev", "3", "--pcode", "2", "--vendor", "0x3F"];
-    let done = coflash(&[&["--bus", &url, "flash", "-N", "12", &file][..], &legacy].concat());
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    coflash(&[&["--bus", &url, "flash", "-N", "12", &file][..], &legacy].concat()).good();
     assert_eq!(server.join().unwrap().fake.node, 12);
     for (node, serial, words) in [
         ("", 4, "device with serial number 00000004h: error: the device has no node-ID [0x60000017]"),
@@ -348,7 +340,6 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     // The update can be repeated.
     fake.on_block = Box::new(|_| Outcome::Accept);
     let (url, server) = serve(fake);
-    let done = coflash(&["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+    coflash(&["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]).good();
     assert_eq!(server.join().unwrap().running, Some(APPLICATION));
 }

@@ -50,8 +50,7 @@ fn flash(folder: &Folder, bus: &[&str], options: &[&str]) -> Done {
     let (path, server) = serve(device());
     let file = data("identity-110.blk");
     let arguments = [bus, &["flash", "-N", "5", &file], options].concat();
-    let done = run(command(folder, "", &arguments).env("FAKE_BUS", path));
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let done = run(command(folder, "", &arguments).env("FAKE_BUS", path)).good();
     let fake = server.join().unwrap();
     assert_eq!(fake.blocks.concat(), fs::read(data("identity-110.blk")).unwrap());
     assert_eq!(fake.running, Some(APPLICATION));
@@ -89,7 +88,7 @@ const LIES: [(&str, &str, i32, &[&str]); 26] = [
         "peak:PCAN_USBBUS1@500k",
         "silent",
         5,
-        &["another node acknowledges the adapter's frames", "coflash catch", "strap"],
+        &["another node acknowledges the adapter's frames", "coflash more catch", "strap"],
     ),
     ("peak:PCAN_USBBUS1", "", 2, &["it needs the bit rate of the bus", "peak:PCAN_USBBUS1@125k"]),
     ("kvaser:1@500k", "", 4, &["it does not exist (canERR_NOTFOUND)", "coflash adapters lists"]),
@@ -178,8 +177,7 @@ fn a_library_that_is_missing_or_old_is_named_with_where_to_get_it() {
 fn adapters_are_listed_and_the_only_one_is_taken() {
     let (peak, kvaser) = (vendor("peak-list", "peak", &[]), vendor("kvaser-list", "kvaser", &[]));
     let urls = |folder: &Folder, lie: &str| {
-        let done = call(folder, lie, &["adapters", "--json"]);
-        assert_eq!(done.exit, 0, "{}", done.err);
+        let done = call(folder, lie, &["adapters", "--json"]).good();
         let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
         let adapters = json["adapters"].as_array().unwrap().clone();
         adapters.iter().map(|one| one["bus"].as_str().unwrap().to_string()).collect::<Vec<_>>()
@@ -209,8 +207,8 @@ fn adapters_are_listed_and_the_only_one_is_taken() {
     {
         assert!(done.err.contains(words), "{}", done.err);
     }
-    let nowhere = run(command(&peak, "", &["scan"])
+    run(command(&peak, "", &["scan"])
         .env("LD_LIBRARY_PATH", Path::new("/nowhere"))
-        .env("COFLASH_SEARCH", "none"));
-    assert!(nowhere.exit == 2 && nowhere.err.contains("no adapter was found"), "{}", nowhere.err);
+        .env("COFLASH_SEARCH", "none"))
+    .fails(2, &["no adapter was found"]);
 }

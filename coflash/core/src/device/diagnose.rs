@@ -64,7 +64,7 @@ impl fmt::Display for Diagnosis {
                     f,
                     "another node acknowledges the adapter's frames, so the bit rate is right: check that \
                      node {node} is the right one (coflash scan asks all of them, coflash lss fastscan finds devices without \
-                     node-ID), and that it is switched on; coflash catch catches a program that never answers while the \
+                     node-ID), and that it is switched on; coflash more catch catches a program that never answers while the \
                      device is switched off and on, or kept from starting by the entry strap"
                 );
             }
@@ -73,7 +73,7 @@ impl fmt::Display for Diagnosis {
                 "nothing at all is heard on the bus: check that the device has power, that both sides use the same bit \
                  rate, and that cable and terminators are right; a device may also be silent because it has no node-ID \
                  (coflash lss fastscan), is off the bus (switch it off and on), or runs a program that never answers (coflash \
-                 catch holds it in the bootloader when it is switched on, and so does the entry strap)"
+                 more catch holds it in the bootloader when it is switched on, and so does the entry strap)"
             );
         }
         self.traffic(f)?;

@@ -276,7 +276,7 @@ fn of_machine(
     let folder = machine::folder(test);
     let nodes = first(&folder);
     let coflash = Coflash::new(&folder, &nodes);
-    coflash.done(&["key", "new", "--role", "root", "-o", "root.pem"]);
+    coflash.done(&["seal", "keys", "new", "--role", "root", "-o", "root.pem"]);
     coflash.done(&["package", "machine.toml", "--key", "root.pem"]);
     folder.write("token", b"g\n");
     let text = format!(

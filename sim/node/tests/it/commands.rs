@@ -41,27 +41,27 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(refused.exit, 7, "{}", refused.err);
     assert!(refused.err.contains("60000014"), "{}", refused.err);
     on(FLASH);
-    assert!(on(&["status"]).contains("running"));
+    assert!(on(&["more", "status"]).contains("running"));
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
-    assert!(on(&["withdraw"]).contains("no longer released for autostart"));
+    assert!(on(&["more", "withdraw"]).contains("no longer released for autostart"));
     // START is then a trial, and after the next reset the device stays in the bootloader.
     assert!(on(&["start"]).contains("an application"));
     nodes.await_line("serial 1, node 5: would start program 1, on trial");
     on(&["reset"]);
     nodes.await_line("serial 1, node 5: bootloader (Unsigned)");
-    assert_eq!(on(&["release"]), "node 5: program 1 is released for autostart\n");
+    assert_eq!(on(&["more", "release"]), "node 5: program 1 is released for autostart\n");
     assert!(on(&["start"]).contains("an application"));
     // The application is called back before the erase; then nothing is left of it.
     assert!(programmed(&folder) > 190 * 1024);
     assert!(on(&["erase"]).starts_with("node 5: program 1 is erased, in "));
     assert_eq!(programmed(&folder), 0, "erased, not only marked");
-    let status = coflash.json(&["status", "-N", "5"]);
+    let status = coflash.json(&["more", "status", "-N", "5"]);
     assert_eq!((&status["crc"], &status["bootloader"]), (&json!(0), &json!(true)));
-    let refused = coflash.run(&["release", "-N", "5"]);
+    let refused = coflash.run(&["more", "release", "-N", "5"]);
     assert_eq!(refused.exit, 6, "{}", refused.err);
-    assert_ne!(coflash.json(&["status", "-N", "5"])["status"]["error"], Value::Null);
-    assert_eq!(coflash.json(&["status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
+    assert_ne!(coflash.json(&["more", "status", "-N", "5"])["status"]["error"], Value::Null);
+    assert_eq!(coflash.json(&["more", "status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
     assert_eq!(on(&["reset"]), "back on the bus: node 5\n");
 }
 
@@ -174,7 +174,7 @@ fn scan_monitor_and_shell_hear_the_nodes() {
     let said = coflash.done(&["monitor", "--count", "3", "-N", "6"]);
     assert_eq!(said.lines().count(), 3, "{said}");
     assert!(said.lines().all(|line| line.contains("node 6: heartbeat, pre-operational")), "{said}");
-    let said = coflash.typed(&["shell"], "info -N 5\nread 1018/4 -N 6\nnonsense\nreset -N 5\n");
+    let said = coflash.typed(&["more", "shell"], "info -N 5\nread 1018/4 -N 6\nnonsense\nreset -N 5\n");
     assert_eq!(said.exit, 2, "typed by a script, the first that fails is the last: {}", said.err);
     assert!(said.out.contains("serial number     00000001h"), "{}{}", said.out, said.err);
     assert!(said.out.contains("node 6, 1018h/4: 2 (00000002h)"), "{}{}", said.out, said.err);
@@ -211,8 +211,16 @@ fn no_bus_no_node_no_sense() {
     // Each command talks to its own node: an update notices other clients of its node.
     let quick =
         |number: usize| ["--sdo-timeout".to_string(), "50".into(), "-N".into(), (9 + number).to_string()];
-    let commands: [&[&str]; 8] =
-        [&["info"], &["status"], &["start"], &["enter"], &["erase"], &["release"], &["withdraw"], FLASH];
+    let commands: [&[&str]; 8] = [
+        &["info"],
+        &["more", "status"],
+        &["start"],
+        &["enter"],
+        &["erase"],
+        &["more", "release"],
+        &["more", "withdraw"],
+        FLASH,
+    ];
     let running = commands.iter().enumerate().map(|(number, command)| {
         let quick = quick(number);
         coflash.spawn(&[command, &quick.each_ref().map(String::as_str)[..]].concat())

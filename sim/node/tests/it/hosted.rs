@@ -105,7 +105,7 @@ fn a_program_that_dies_leads_into_the_bootloader() {
     assert_eq!(trial.exit, 7, "{}{}", trial.out, trial.err);
     nodes.await_line("serial 1: program 1 has ended by itself: exit status: 3");
     nodes.await_line("serial 1, node 7: bootloader (Unsigned)");
-    coflash.done(&["release", "-N", "7"]);
+    coflash.done(&["more", "release", "-N", "7"]);
     coflash.run(&["start", "-N", "7"]);
     for _ in 0..3 {
         nodes.await_line("serial 1: program 1 has ended by itself: exit status: 3");

@@ -45,7 +45,7 @@ fn the_file_holds_the_program_and_nothing_else() {
     let said = coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
     assert!(said.contains("not released for autostart"), "{said}");
-    coflash.done(&["release", "-N", "5"]);
+    coflash.done(&["more", "release", "-N", "5"]);
     let flash = folder.read("1.flash");
     assert!(flash[..0x4000].iter().all(|byte| *byte == 0xFF), "where the chip has its bootloader");
     assert!(flash[0x4000..0x8000].iter().any(|byte| *byte != 0xFF), "the parameters");
@@ -58,7 +58,7 @@ fn the_file_holds_the_program_and_nothing_else() {
     nodes.await_line("serial 1, node 5: would start program 1");
     // Without a CPU there is no answer.
     let coflash = Coflash::new(&folder, &nodes);
-    assert_eq!(coflash.run(&["status", "-N", "5", "--sdo-timeout", "50"]).exit, 5);
+    assert_eq!(coflash.run(&["more", "status", "-N", "5", "--sdo-timeout", "50"]).exit, 5);
     drop(nodes);
     let nodes = Nodes::start(&folder, &["--node", "5", "--stay"]);
     nodes.await_line("serial 1, node 5: bootloader (Strap)");
@@ -72,7 +72,7 @@ fn conform_installs_into_a_node_with_crc_16() {
     let folder = folder("crc16-conform");
     let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in", "--crc16"]);
     let image = ["--install", "--image", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
-    let done = Coflash::new(&folder, &nodes).run(&[&["conform", "-N", "7"], &image[..]].concat());
+    let done = Coflash::new(&folder, &nodes).run(&[&["more", "conform", "-N", "7"], &image[..]].concat());
     let updates = done.out.lines().filter(|line| line.starts_with("UPD-"));
     let bad: Vec<_> = updates.filter(|line| line.contains("FAILED")).collect();
     assert!(bad.is_empty() && done.out.contains("UPD-011   passed"), "{bad:?}\n{}", done.out);

@@ -258,7 +258,7 @@ fn a_report_has_what_service_needs_and_no_password() {
         log.contains("  frame  ") && log.contains("read 1000h/0") && log.ends_with("exit code 0\n"),
         "{log}"
     );
-    let line = coflash.typed(&["shell"], "info -N 5 --log-file line.log\n");
+    let line = coflash.typed(&["more", "shell"], "info -N 5 --log-file line.log\n");
     assert!(line.exit == 2 && line.err.contains("apply only to the shell as a whole"), "{}", line.err);
     let nowhere = coflash.run(&["info", "-N", "5", "--log-file", "none/info.log"]);
     assert!(nowhere.exit == 1 && nowhere.err.contains("cannot be written"), "{}", nowhere.err);

@@ -14,6 +14,27 @@ pub struct Done {
     pub err: String,
 }
 
+impl Done {
+    /// Checks that the command has succeeded.
+    #[track_caller]
+    pub fn good(self) -> Self {
+        assert_eq!(self.exit, 0, "{}{}", self.out, self.err);
+        self
+    }
+
+    /// Checks that the command has failed with this exit code and all these words.
+    #[track_caller]
+    pub fn fails(&self, exit: i32, words: &[&str]) {
+        let Self { out, err, .. } = self;
+        let missing: Vec<&&str> = words.iter().filter(|words| !err.contains(**words)).collect();
+        assert!(
+            self.exit == exit && missing.is_empty(),
+            "{} and not {exit}, {missing:?}: {out}{err}",
+            self.exit
+        );
+    }
+}
+
 /// The tool without the settings, the adapters and the locks of the user who runs the tests.
 pub fn command() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));

@@ -21,16 +21,16 @@ const VALUE_DOMAIN: &[u8] = b"coboot key of a value 1\0";
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum KeyFault {
     /// The text is not a PEM file of an Ed25519 private key.
-    #[error("it is not an Ed25519 private key in PKCS#8 PEM: make one with `coflash key new` or `openssl genpkey -algorithm ed25519`; decrypt a key with a password first (openssl pkey)")]
+    #[error("it is not an Ed25519 private key in PKCS#8 PEM: make one with `coflash seal keys new` or `openssl genpkey -algorithm ed25519`; decrypt a key with a password first (openssl pkey)")]
     NoPrivateKey,
     /// The text is not a PEM file of an Ed25519 public key.
-    #[error("it is not an Ed25519 public key in PEM (SPKI): `coflash key new` writes one beside the private key, or use `openssl pkey -pubout`")]
+    #[error("it is not an Ed25519 public key in PEM (SPKI): `coflash seal keys new` writes one beside the private key, or use `openssl pkey -pubout`")]
     NoPublicKey,
     /// The bytes are not a public key, or a key that accepts any signature.
     #[error("these 32 bytes are not an Ed25519 public key: the key is damaged; make a new one")]
     NoPoint,
     /// The text is not the file of a key-encryption key.
-    #[error("it is not a key-encryption key: make one with `coflash key new --role kek`, or give 64 hexadecimal digits")]
+    #[error("it is not a key-encryption key: make one with `coflash seal keys new --role kek`, or give 64 hexadecimal digits")]
     NoKek,
     /// The id 0 means "no key".
     #[error("the id of this key is 0, which is reserved: make a new one")]

@@ -50,7 +50,7 @@ pub enum SealFault {
     #[error("the image would be encrypted twice for the key {0:08X}h: give each key once")]
     Twice(u32),
     /// The certificate is invalid.
-    #[error("the certificate is invalid: give a file that `coflash key certify` made")]
+    #[error("the certificate is invalid: give a file that `coflash seal keys certify` made")]
     NoCertificate,
     /// The certificate belongs to another key.
     #[error("the certificate belongs to another key: give the certificate of the signing key {0:08X}h")]

@@ -437,7 +437,7 @@ fn a_program_that_fails_its_trial_is_not_released() {
     let (number, words, advice) = trial(&|fake| fake.starts = None);
     assert_eq!((number, &*words), (0x6000_0014, "node 5 has not answered since the program was started"));
     assert!(
-        advice.contains("switch the device off and on") && advice.contains("coflash catch --node 5"),
+        advice.contains("switch the device off and on") && advice.contains("coflash more catch --node 5"),
         "{advice}"
     );
     let (number, words, _) = trial(&|fake| fake.starts = Some(BOOTLOADER));
@@ -458,7 +458,7 @@ fn a_program_that_fails_its_trial_is_not_released() {
     );
     // Not --no-trial: that would install what can never be updated.
     assert!(!advice.contains("--no-trial"), "{advice}");
-    for words in ["docs/application.md", "coflash reset --node 5", "coflash catch --node 5"] {
+    for words in ["docs/application.md", "coflash reset --node 5", "coflash more catch --node 5"] {
         assert!(advice.contains(words), "{advice}");
     }
     let refuses = Outcome::Abort(0x0800_0022);
@@ -762,8 +762,8 @@ fn an_application_that_does_not_go_back() {
     for (code, words, others) in [
         (0x0602_0000, "cannot be called back", "entry strap"),
         (0x0609_0030, "does not know the call", "--dialect raw"),
-        (0x0800_0022, refuses, "run coflash catch --node 5"),
-        (0x0800_0021, refuses, "run coflash catch --node 5"),
+        (0x0800_0022, refuses, "run coflash more catch --node 5"),
+        (0x0800_0021, refuses, "run coflash more catch --node 5"),
         (0x0606_0000, "run the command again", "the abort code gives the device's reason"),
         (0x0504_0001, "frames were lost", "second tool"),
     ] {

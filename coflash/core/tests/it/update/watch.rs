@@ -130,7 +130,7 @@ fn a_program_that_falls_silent_in_its_watch_is_told() {
         let text = text(&error);
         assert_eq!(error.number(), 0x6000_0014, "{text}");
         assert!(text.contains("it answered after its start, and node 5 is silent since then"), "{text}");
-        assert!(!text.contains("was reset") && text.contains("coflash catch --node 5"), "{text}");
+        assert!(!text.contains("was reset") && text.contains("coflash more catch --node 5"), "{text}");
         assert_eq!(text.contains("not released for autostart"), !released, "{text}");
         let state = if released { DeviceState::Released } else { DeviceState::Unreleased };
         assert_eq!(left(&events), state);

@@ -1,4 +1,4 @@
-//! `coflash nameplate`: makes the identity of an OEM's device, for production.
+//! `coflash seal nameplate`: makes the identity of an OEM's device, for production.
 
 use std::path::PathBuf;
 
@@ -8,19 +8,20 @@ use coflash_core::file::nameplate::{nameplate, LAST_BLOCK};
 use serde_json::json;
 use shared_abi::nameplate::Nameplate;
 
-use super::context::Context;
-use super::output::Failure;
-use super::output_file::write;
-use super::values::number;
+use crate::context::Context;
+use crate::output::Failure;
+use crate::output_file::write;
+use crate::values::number;
 
-/// Makes a nameplate: the identity (1018h) of an OEM's device, for the one-time programmable bytes of its
-/// chip.
+/// Makes a nameplate, the identity of an OEM's device.
+///
+/// It is the identity (1018h) for the one-time programmable bytes of the device's chip.
 ///
 /// The programmer of the production line writes the file; no bootloader and no tool over CAN does. It
 /// counts for a bootloader whose product has the choice identity = Otp. The last good nameplate counts,
 /// so one in a later block corrects a mistake.
 #[derive(Debug, Args)]
-pub(super) struct MakeNameplate {
+pub(crate) struct MakeNameplate {
     /// The file to write, Intel HEX.
     #[arg(value_name = "OUT")]
     output: PathBuf,
@@ -52,7 +53,7 @@ pub(super) struct MakeNameplate {
 }
 
 impl MakeNameplate {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let Self { output, vendor, product, revision, serial, block, lock } = self;
         let plate = Nameplate::new(*vendor, *product, *revision, *serial);
         let image = nameplate(&plate, *block, *lock);
@@ -65,9 +66,8 @@ impl MakeNameplate {
             if *lock { ", which it locks with those after it" } else { "" },
             if *serial == 0 { ": the chip's own" } else { "" },
         );
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "nameplate",
                 "output": output.display().to_string(),
                 "block": block,
                 "address": address,

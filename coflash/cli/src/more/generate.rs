@@ -1,4 +1,4 @@
-//! `coflash completions` and `coflash man`: files for an installer.
+//! `coflash more completions` and `coflash more man`: files for an installer.
 
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -7,13 +7,13 @@ use clap::{Arg, Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 
-use super::context::Context;
-use super::help;
-use super::output::{Failure, EXIT_CODES};
+use crate::context::Context;
+use crate::help;
+use crate::output::{Failure, EXIT_CODES};
 
 /// Writes shell completions to standard output.
 #[derive(Debug, Args)]
-pub(super) struct Completions {
+pub(crate) struct Completions {
     #[arg(value_enum)]
     shell: Shell,
 }
@@ -23,25 +23,25 @@ pub(super) struct Completions {
 /// By default, the page of the program goes to standard output. With --out, one page for each
 /// command goes into a folder.
 #[derive(Debug, Args)]
-pub(super) struct Manual {
+pub(crate) struct Manual {
     /// The folder.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
 }
 
 impl Completions {
-    pub(super) fn run(&self, mut commands: Command) -> Result<(), Failure> {
+    pub(crate) fn run(&self) -> Result<(), Failure> {
         // Written to memory first: clap's own writer panics if standard output is closed.
         let mut script = Vec::new();
-        clap_complete::generate(self.shell, &mut commands, "coflash", &mut script);
+        clap_complete::generate(self.shell, &mut crate::commands(), "coflash", &mut script);
         let _ = std::io::stdout().write_all(&script);
         Ok(())
     }
 }
 
 impl Manual {
-    pub(super) fn run(&self, context: &Context, commands: Command) -> Result<(), Failure> {
-        let mut commands = commands.disable_help_subcommand(true);
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let mut commands = crate::commands().disable_help_subcommand(true);
         commands.build();
         let Some(folder) = &self.out else {
             let page = page(&commands)
@@ -80,11 +80,10 @@ fn page(command: &Command) -> io::Result<Vec<u8>> {
     if command.get_subcommands().any(|below| !below.is_hide_set()) {
         man.render_subcommands_section(&mut page)?;
     }
-    let name = command.get_display_name().unwrap_or_default();
-    let name = name.strip_prefix("coflash-").unwrap_or_default();
-    if let Some(examples) = help::examples(name) {
-        let lines = examples.lines().filter_map(|line| line.strip_prefix("  "));
-        section(&mut page, "EXAMPLES", &lines.map(|line| (line, "")).collect::<Vec<_>>())?;
+    let examples = help::examples(command.get_bin_name().unwrap_or_default());
+    if !examples.is_empty() {
+        let lines: Vec<String> = examples.iter().map(|line| format!("coflash {line}")).collect();
+        section(&mut page, "EXAMPLES", &lines.iter().map(|line| (line.as_str(), "")).collect::<Vec<_>>())?;
     }
     section(&mut page, "FILES", &FILES)?;
     let variables = variables(command);
@@ -104,7 +103,7 @@ fn page(command: &Command) -> io::Result<Vec<u8>> {
 const FILES: [(&str, &str); 3] = [
     ("coflash.toml", "Defaults for options, in the current folder."),
     ("~/.config/coflash/coflash.toml", "Defaults of the user, if the current folder has no such file."),
-    ("~/.local/state/coflash/history", "The commands typed into coflash shell."),
+    ("~/.local/state/coflash/history", "The commands typed into coflash more shell."),
 ];
 
 /// The environment variables of the options.

@@ -1,4 +1,4 @@
-//! `coflash report bundle`: what somebody needs who is to find a fault, in one archive.
+//! `coflash more report bundle`: what somebody needs who is to find a fault, in one archive.
 //!
 //! Nothing gets into it that was not read and understood: a line of a file that is no event, no
 //! message and no frame stays out, so that no other file does under such a name. Firmware stays out,
@@ -16,18 +16,17 @@ use coflash_core::device::info::info;
 use coflash_core::machine::zip::{self, is_name, Member, MAX_MEMBER, MAX_MEMBERS};
 use serde_json::{json, Value};
 
-use super::adapters;
-use super::context::Context;
-use super::device::Device;
-use super::info;
-use super::output::Failure;
-use super::output_file::write;
-use super::record::{self, FILES};
-use super::secrets::without_urls;
+use crate::adapters;
+use crate::context::Context;
+use crate::device::Device;
+use crate::output::Failure;
+use crate::output_file::write;
+use crate::record::{self, FILES};
+use crate::secrets::without_urls;
 
 /// Collects what is needed to find a fault.
 #[derive(Debug, Args)]
-pub(super) struct Report {
+pub(crate) struct Report {
     #[command(subcommand)]
     job: Job,
 }
@@ -70,7 +69,7 @@ const MOST_RUNS: usize = (MAX_MEMBERS - 1 - OF_NOW.len()) / FILES.len();
 const SHOW_CONTENTS: [&str; 3] = ["read", "debug", "shell"];
 
 impl Report {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let Job::Bundle(bundle) = &self.job;
         bundle.run(context)
     }
@@ -121,9 +120,8 @@ impl Bundle {
         write(&self.output, &zip::write(&members.collect::<Vec<_>>()))?;
         let output = self.output.display();
         let words = format!("{output}: {} files of {} runs; {answer}", names.len(), taken.len());
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "report bundle",
                 "output": output.to_string(),
                 "runs": taken.len(),
                 "answer": answer,
@@ -140,7 +138,7 @@ impl Bundle {
         let waiting = context.waiting(format!("node {} answers", session.node()));
         let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         drop(waiting);
-        Ok(info::value(&info))
+        Ok(json!(info))
     }
 
     /// The folders of the runs, the oldest first; the run of this command is none of them.
@@ -195,7 +193,7 @@ fn versions(context: &Context) -> Value {
         "processor": std::env::consts::ARCH,
         "release": release.map(|name| name.trim_matches('"')),
         "kernel": kernel.as_deref().map(str::trim),
-        "configuration": super::config::find(context.config.clone()),
+        "configuration": crate::config::find(context.config.clone()),
         "environment": set,
     })
 }
@@ -224,8 +222,8 @@ impl Archive {
         let text = fs::read_to_string(&report).map_err(|error| Failure::unreadable(&report, &error))?;
         let document = serde_json::from_str(&text).ok().filter(Value::is_object);
         let mut document = document.ok_or_else(|| Failure::file(&report, "is not the report of a run"))?;
-        let shows = |command: &Value| SHOW_CONTENTS.iter().any(|name| command == name);
-        let shows_contents = shows(&document["command"]);
+        let command = document["command"].as_str().unwrap_or_default();
+        let shows_contents = command.split(' ').any(|word| SHOW_CONTENTS.contains(&word));
         if shows_contents {
             document["result"] = Value::Null;
         }

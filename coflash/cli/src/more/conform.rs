@@ -1,4 +1,4 @@
-//! `coflash conform`: conformance checks on a device.
+//! `coflash more conform`: conformance checks on a device.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -16,19 +16,19 @@ use coflash_core::file::convert::Label;
 use coflash_core::update::Payload;
 use serde_json::json;
 
-use super::context::Context;
-use super::device::cancelled;
-use super::file::{warn, Source};
-use super::output::Failure;
-use super::output_file;
-use super::values::{milliseconds, node_id};
+use crate::context::Context;
+use crate::device::cancelled;
+use crate::file::{warn, Source};
+use crate::output::Failure;
+use crate::output_file;
+use crate::values::{milliseconds, node_id};
 
 /// Checks whether a device conforms to CiA 301 and CiA 305, with a verdict for each check.
 ///
 /// No check touches the program, unless --install asks for it. The device is left in the NMT state in
 /// which it was found, also after Ctrl-C. Checks that reset the device run only with --reset.
 #[derive(Debug, Args)]
-pub(super) struct Conform {
+pub(crate) struct Conform {
     /// The checks or groups to run, for example SDO or SDO-003; by default all.
     #[arg(value_name = "CHECK")]
     checks: Vec<String>,
@@ -71,12 +71,12 @@ pub(super) struct Conform {
 }
 
 impl Conform {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let chosen = self.chosen()?;
         if self.list {
             let line = |check: &Check| format!("{:9} {} ({})", check.id, check.title, check.clause);
             let lines: Vec<_> = chosen.iter().map(line).collect();
-            context.out.result(lines.join("\n"), || {
+            context.result(lines.join("\n"), || {
                 let list: Vec<_> = chosen
                     .iter()
                     .map(|c| {
@@ -84,7 +84,7 @@ impl Conform {
                                        "installs": c.installs })
                     })
                     .collect();
-                json!({ "command": "conform", "checks": list })
+                json!({ "checks": list })
             });
             return Ok(());
         }
@@ -93,7 +93,7 @@ impl Conform {
         let mut adapter = context.open()?;
         let warnings = self.warnings(&mut *adapter);
         warnings.iter().for_each(|warning| context.out.warn(warning));
-        let tell = &mut |verdict: &Verdict| {
+        let report = &mut |verdict: &Verdict| {
             let (word, why) = words(&verdict.outcome);
             let why = if why.is_empty() { String::new() } else { format!(": {why}") };
             context.out.say(format_args!("{:9} {word:7} {}{why}", verdict.check.id, verdict.check.title));
@@ -101,13 +101,13 @@ impl Conform {
         let is_asked = |check: &Check| (self.reset || !check.resets) && (self.install || !check.installs);
         let chosen: Vec<_> = chosen.into_iter().filter(is_asked).collect();
         let means = Means { answer: self.answer_timeout, image, power: self.power() };
-        let verdicts = run(&mut *adapter, self.node, &chosen, means, &cancelled()?, tell)?;
+        let verdicts = run(&mut *adapter, self.node, &chosen, means, &cancelled()?, report)?;
         if let Some(path) = &self.junit {
             output_file::write(path, junit(&verdicts).as_bytes())?;
         }
         let count = |word: &str| verdicts.iter().filter(|v| words(&v.outcome).0 == word).count();
         let (passed, failed, skipped) = (count("passed"), count("FAILED"), count("skipped"));
-        context.out.result(format_args!("{passed} passed, {failed} failed, {skipped} skipped"), || {
+        context.result(format_args!("{passed} passed, {failed} failed, {skipped} skipped"), || {
             let list: Vec<_> = verdicts
                 .iter()
                 .map(|Verdict { check, outcome }| {
@@ -116,7 +116,7 @@ impl Conform {
                             "outcome": word.to_lowercase(), "why": why })
                 })
                 .collect();
-            json!({ "command": "conform", "node": self.node.get(), "passed": passed, "failed": failed,
+            json!({ "node": self.node.get(), "passed": passed, "failed": failed,
                     "skipped": skipped, "checks": list, "warnings": warnings })
         });
         if failed == 0 {
@@ -160,7 +160,7 @@ impl Conform {
     fn chosen(&self) -> Result<Vec<Check>, Failure> {
         let all = checks();
         if let Some(word) = self.checks.iter().find(|word| !all.iter().any(|check| check.is_named(word))) {
-            let advice = "coflash conform --list shows the checks";
+            let advice = "coflash more conform --list shows the checks";
             return Err(Failure::usage(format!("there is no check and no group '{word}'"), advice));
         }
         let wanted = |check: &Check| self.checks.is_empty() || self.checks.iter().any(|w| check.is_named(w));

@@ -1,4 +1,4 @@
-//! `coflash unlock` and `events`: what the holder of the root key can do with a sealed device.
+//! `coflash seal unlock` and `events`: what the holder of the root key can do with a sealed device.
 
 use std::path::PathBuf;
 
@@ -7,18 +7,18 @@ use coflash_core::device::access::{ask, challenge, events};
 use seal::access::right;
 use serde_json::json;
 
-use super::context::Context;
-use super::device::Device;
-use super::keys::signing_key;
-use super::output::Failure;
-use super::values::number;
+use crate::context::Context;
+use crate::device::Device;
+use crate::output::Failure;
+use crate::seal::keys::signing_key;
+use crate::values::number;
 
-/// Asks a sealed device for rights, with the signature of a root key.
+/// Asks a sealed device for rights, by a root key.
 ///
 /// The device must be in its bootloader. Rights last until its next reset. After a wrong signature
 /// the device waits before it accepts another one; the wait grows with each wrong signature.
 #[derive(Debug, Args)]
-pub(super) struct Unlock {
+pub(crate) struct Unlock {
     /// The rights to ask for, separated by commas.
     #[arg(value_enum, value_delimiter = ',', required = true)]
     rights: Vec<Right>,
@@ -66,16 +66,17 @@ impl Right {
     }
 }
 
-/// Shows the events that a sealed device has recorded: the last eight installations, refusals and
-/// grants of rights.
+/// Shows the events that a sealed device has recorded.
+///
+/// They are the last eight installations, refusals and grants of rights.
 #[derive(Debug, Args)]
-pub(super) struct Events {
+pub(crate) struct Events {
     #[command(flatten)]
     device: Device,
 }
 
 impl Unlock {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let key = signing_key(&self.root)?;
         let rights = self.rights.iter().fold(0, |bits, right| bits | right.bit());
         let asked = (rights, self.counter.unwrap_or(0), key.public().id());
@@ -93,7 +94,7 @@ impl Unlock {
         if !granted {
             return Err(Failure::usage(
                 format!("node {node} has not granted the rights"),
-                "use the private key of one of the device's roots (coflash key show), and wait half a minute",
+                "use the private key of one of the device's roots (coflash seal keys show), and wait half a minute",
             ));
         }
         let words = if rights & right::OPEN != 0 {
@@ -101,16 +102,14 @@ impl Unlock {
         } else {
             "rights granted until the next reset"
         };
-        context.out.result(
-            format_args!("node {node}: {words}"),
-            || json!({ "command": "unlock", "node": node.get(), "rights": rights }),
-        );
+        context
+            .result(format_args!("node {node}: {words}"), || json!({ "node": node.get(), "rights": rights }));
         Ok(())
     }
 }
 
 impl Events {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let recorded = events(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
@@ -118,7 +117,7 @@ impl Events {
         let lines: String = recorded.iter().map(|event| format!("\n{event}")).collect();
         let words =
             if recorded.is_empty() { "no events are recorded" } else { "recorded events, the newest first" };
-        context.out.result(format_args!("node {node}: {words}{lines}"), || {
+        context.result(format_args!("node {node}: {words}{lines}"), || {
             let events: Vec<_> = recorded
                 .iter()
                 .map(|event| {
@@ -131,7 +130,7 @@ impl Events {
                     })
                 })
                 .collect();
-            json!({ "command": "events", "node": node.get(), "events": events })
+            json!({ "node": node.get(), "events": events })
         });
         Ok(())
     }

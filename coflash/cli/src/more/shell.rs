@@ -1,4 +1,4 @@
-//! `coflash shell`: runs several commands one after another.
+//! `coflash more shell`: runs several commands one after another.
 
 use std::io::IsTerminal;
 use std::sync::atomic::Ordering;
@@ -7,10 +7,10 @@ use clap::Args;
 use rustyline::error::ReadlineError;
 use rustyline::DefaultEditor;
 
-use super::context::Context;
-use super::device::cancelled;
-use super::memory;
-use super::output::Failure;
+use crate::context::Context;
+use crate::device::cancelled;
+use crate::memory;
+use crate::output::Failure;
 
 /// Reads commands from the keyboard or from standard input and runs them.
 ///
@@ -19,14 +19,11 @@ use super::output::Failure;
 /// The options of the command line (--bus, --json and so on) apply to all commands. `exit` or
 /// Ctrl-D ends the shell. If a command from standard input fails, the shell ends.
 #[derive(Debug, Args)]
-pub(super) struct Shell {}
-
-/// The function that runs one line, passed as words.
-pub(super) type Runner = fn(&Context, Vec<String>) -> Result<(), Failure>;
+pub(crate) struct Shell {}
 
 impl Shell {
-    /// Reads commands and runs each of them with `command`.
-    pub(super) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
+    /// Reads commands and runs each of them.
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
         let history = interactive.then(|| memory::file("history")).flatten();
         let mut editor = DefaultEditor::new()
@@ -53,7 +50,7 @@ impl Shell {
                 let _ = editor.add_history_entry(&line);
             }
             cancelled()?.store(false, Ordering::Relaxed);
-            match (command(context, words), interactive) {
+            match (crate::shell_line(context, words), interactive) {
                 (Ok(()), _) => {}
                 (Err(failure), true) => context.out.failure(&failure),
                 (Err(failure), false) => return Err(failure),

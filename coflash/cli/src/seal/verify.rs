@@ -1,4 +1,4 @@
-//! `coflash verify` and `coflash show`: checks and describes a sealed image.
+//! `coflash seal verify` and `coflash seal show`: checks and describes a sealed image.
 
 use std::path::{Path, PathBuf};
 
@@ -11,19 +11,19 @@ use seal::wire::tag;
 use serde_json::{json, Value};
 use shared_abi::block_file::ProgramVersion;
 
-use super::context::Context;
-use super::file::{base, bytes};
-use super::keys::{self, KeyBlock};
-use super::output::Failure;
-use super::values::{number, program_number, unique_id};
+use crate::context::Context;
+use crate::file::{base, bytes};
+use crate::output::Failure;
+use crate::seal::keys::{self, KeyBlock};
+use crate::values::{number, program_number, unique_id};
 
-/// Checks a sealed image as a device does, and names the rule that it breaks.
+/// Checks a sealed image as a device does.
 ///
-/// This covers the form, the target device, counter and epoch, the certificate, the signature,
+/// A bad image is shown with the rule that it breaks. This covers the form, the target device, counter and epoch, the certificate, the signature,
 /// every chunk, and the program itself. A property of the device that no option gives is assumed to
 /// match the image. Without --kek the program in an encrypted image is not checked.
 #[derive(Debug, Args)]
-pub(super) struct Verify {
+pub(crate) struct Verify {
     #[command(flatten)]
     checked: Checked,
 
@@ -54,10 +54,10 @@ pub(super) struct Verify {
 
 /// A sealed image, and the keys to check it with.
 #[derive(Debug, Args)]
-pub(super) struct Checked {
+pub(crate) struct Checked {
     /// The sealed image, or the block file that carries one.
     #[arg(value_name = "FILE")]
-    pub(super) file: PathBuf,
+    pub(crate) file: PathBuf,
 
     #[command(flatten)]
     keys: KeyBlock,
@@ -67,9 +67,11 @@ pub(super) struct Checked {
     base: Option<PathBuf>,
 }
 
-/// Shows the contents of a sealed image's manifest. Only the form is checked.
+/// Shows the manifest of a sealed image.
+///
+/// Only its form is checked.
 #[derive(Debug, Args)]
-pub(super) struct Show {
+pub(crate) struct Show {
     /// The sealed image, or the block file that carries one.
     #[arg(value_name = "FILE")]
     file: PathBuf,
@@ -78,7 +80,7 @@ pub(super) struct Show {
 impl Checked {
     /// Checks the image for a device with these keys; `device` holds the other properties. Returns
     /// the file and the opened image.
-    pub(super) fn check(&self, device: &Device<'_>) -> Result<(SealedFile, Opened), Failure> {
+    pub(crate) fn check(&self, device: &Device<'_>) -> Result<(SealedFile, Opened), Failure> {
         let path = &self.file;
         let refused = |refusal| Failure::sealed(path, &refusal);
         let bytes = read(path)?.image;
@@ -92,7 +94,7 @@ impl Checked {
 }
 
 impl Verify {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.checked.file;
         let (file, opened) = self.checked.check(&Device {
             vendor_id: self.vendor,
@@ -125,9 +127,8 @@ impl Verify {
             head.counter(),
             opened.epoch,
         );
-        context.out.result(words, || {
+        context.result(words, || {
             let mut value = value(&file);
-            value["command"] = "verify".into();
             value["signed_by"] = key.into();
             value["root"] = root.into();
             value["epoch"] = opened.epoch.into();
@@ -139,22 +140,21 @@ impl Verify {
 }
 
 impl Show {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        show(context, "show", &self.file)
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+        show(context, &self.file)
     }
 }
 
-/// Shows a sealed image, for the command with this name.
-pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), Failure> {
+/// Shows a sealed image.
+pub(crate) fn show(context: &Context, path: &Path) -> Result<(), Failure> {
     let Carried { image, blocks } = read(path)?;
     let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(path, &refusal))?;
     let carrier = blocks.as_ref().map_or_else(String::new, |program| {
         let (count, start) = (BlockFile::of(program).blocks().len(), program.start());
         format!("block file, {count} blocks, from {start:#010x} on; in it: ")
     });
-    context.out.result(format_args!("{}: {carrier}{}", path.display(), file.parts()), || {
+    context.result(format_args!("{}: {carrier}{}", path.display(), file.parts()), || {
         let mut value = value(&file);
-        value["command"] = command.into();
         value["blocks"] = json!(blocks.as_ref().map(|program| json!({
             "count": BlockFile::of(program).blocks().len(),
             "start": program.start(),
@@ -168,21 +168,21 @@ pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), 
 
 /// Whether the file begins as a sealed image, or as a block file that carries one; `false` if it
 /// cannot be read.
-pub(super) fn is_sealed(path: &Path) -> bool {
+pub(crate) fn is_sealed(path: &Path) -> bool {
     use std::io::Read as _;
-    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
+    let is_file = std::fs::metadata(path).is_ok_and(|about| about.is_file());
     let mut front = Vec::new();
     let mut read = |file: std::fs::File| file.take(blocks::FRONT as u64).read_to_end(&mut front);
     is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && blocks::looks_like(&front)
 }
 
 /// Reads a sealed image, from the blocks of a block file if the file is one.
-pub(super) fn read(path: &Path) -> Result<Carried, Failure> {
+pub(crate) fn read(path: &Path) -> Result<Carried, Failure> {
     Ok(carried(bytes(path)?).map_err(|fault| fault.of(path.display()))?)
 }
 
 /// The JSON value of a sealed image.
-pub(super) fn value(file: &SealedFile) -> Value {
+pub(crate) fn value(file: &SealedFile) -> Value {
     let sealed = file.parts();
     let head = sealed.head;
     let record = |wanted: u16| head.records().find(|(tag, _)| *tag == wanted).map(|(_, bytes)| bytes);

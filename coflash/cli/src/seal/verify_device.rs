@@ -1,16 +1,16 @@
-//! `coflash verify-device`: checks whether a device holds the program of a sealed image.
+//! `coflash seal verify-device`: checks whether a device holds the program of a sealed image.
 
 use clap::Args;
 use coflash_core::device::delivery::{delivery, Delivery};
 use coflash_core::device::option_bytes::sector_list;
-use coflash_core::file::sealed::Device as Its;
+use coflash_core::file::sealed::Device as Target;
 use coflash_core::update::{compare_sealed, Comparison};
 use serde_json::json;
 
-use super::context::Context;
-use super::device::Device;
-use super::output::Failure;
-use super::verify::Checked;
+use crate::context::Context;
+use crate::device::Device;
+use crate::output::Failure;
+use crate::seal::verify::Checked;
 
 /// Checks whether a device holds exactly the program of a sealed image.
 ///
@@ -26,7 +26,7 @@ use super::verify::Checked;
 /// The answers come from the device's own software: a device with foreign software may give any
 /// answers.
 #[derive(Debug, Args)]
-pub(super) struct VerifyDevice {
+pub(crate) struct VerifyDevice {
     #[command(flatten)]
     checked: Checked,
 
@@ -35,9 +35,9 @@ pub(super) struct VerifyDevice {
 }
 
 impl VerifyDevice {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.checked.file;
-        let (file, opened) = self.checked.check(&Its::default())?;
+        let (file, opened) = self.checked.check(&Target::default())?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let comparison =
@@ -65,7 +65,7 @@ impl VerifyDevice {
         if let (Some(renewal), Some(protected)) = (renewal, protected) {
             let wanted = match renewal {
                 true => "sector 0 and no others: the bootloader can be renewed",
-                false => "the sectors that coflash provision names (0 and 4 on the boards of coboot)",
+                false => "the sectors that coflash seal provision names (0 and 4 on the boards of coboot)",
             };
             words +=
                 &format!("\n  protection   the device has {}; it needs {wanted}", sector_list(protected));
@@ -74,9 +74,8 @@ impl VerifyDevice {
             let objects: Vec<String> = untold.iter().map(ToString::to_string).collect();
             words += &format!("\n  not reported {}", objects.join(", "));
         }
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "verify-device",
                 "node": node.get(),
                 "program": program,
                 "same": comparison.is_same(),

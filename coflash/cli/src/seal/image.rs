@@ -1,4 +1,4 @@
-//! `coflash seal`: makes a sealed image from a program.
+//! `coflash seal image`: makes a sealed image from a program.
 
 use std::path::{Path, PathBuf};
 
@@ -15,23 +15,25 @@ use seal::wire::{flag, BOOTLOADER, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout::Layout;
 
-use super::context::Context;
-use super::file::{base, Input, Place};
-use super::keys;
-use super::objects::bytes_of;
-use super::output::Failure;
-use super::output_file::write;
-use super::values::{number, program_number, unique_id};
-use super::verify::value;
+use crate::context::Context;
+use crate::file::{base, Input, Place};
+use crate::objects::bytes_of;
+use crate::output::Failure;
+use crate::output_file::write;
+use crate::seal::keys;
+use crate::seal::verify::value;
+use crate::values::{number, program_number, unique_id};
 
-/// Seals a program for devices with keys: signs it, and encrypts or compresses it if asked to.
+/// Seals a program: signs it, encrypts and compresses it.
+///
+/// It is encrypted and compressed only if asked to.
 ///
 /// The same input gives the same output, byte for byte.
 ///
 /// For a key in a hardware security module this takes two steps: first --tbs with the public key,
 /// and, after the module has signed that file, --attach.
 #[derive(Debug, Args)]
-pub(super) struct Seal {
+pub(crate) struct Image {
     #[command(flatten)]
     input: Input,
 
@@ -54,7 +56,7 @@ pub(super) struct Seal {
     counter: Option<u32>,
 
     /// Seal the bootloader in the file, for a renewal. Counter, version and target are those of its header; the
-    /// certificate must be for bootloaders (coflash key certify --role bootloader).
+    /// certificate must be for bootloaders (coflash seal keys certify --role bootloader).
     #[arg(long, conflicts_with_all = ["program", "data", "writes_flash", "base", "vendor", "product", "ver", "hardware", "tbs", "attach"])]
     bootloader: bool,
 
@@ -68,11 +70,11 @@ pub(super) struct Seal {
 
     /// The program's version: major in bits 0-7, minor in bits 8-15, release in bits 16-31; by
     /// default that of the label in the image.
-    #[arg(long, value_name = "NUMBER", value_parser = number)]
+    #[arg(long, value_name = "NUMBER", value_parser = number, hide_short_help = true)]
     ver: Option<u32>,
 
     /// The date in the image, in seconds since 1970; by default SOURCE_DATE_EPOCH, otherwise none.
-    #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
+    #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH", hide_short_help = true)]
     date: Option<u64>,
 
     /// The program number on the board.
@@ -158,30 +160,30 @@ fn chunk(text: &str) -> Result<u8, String> {
 }
 
 /// A program to seal, and the options for it.
-pub(super) struct ToSeal<'p> {
+pub(crate) struct ToSeal<'p> {
     /// Its file.
-    pub(super) path: &'p Path,
+    pub(crate) path: &'p Path,
     /// What is in it.
-    pub(super) program: &'p Program,
+    pub(crate) program: &'p Program,
     /// The memory map of its device, if it is known.
-    pub(super) board: Option<&'static Layout>,
+    pub(crate) board: Option<&'static Layout>,
     /// Vendor-ID and product code; if absent, those of its label.
-    pub(super) identity: (Option<u32>, Option<u32>),
+    pub(crate) identity: (Option<u32>, Option<u32>),
     /// The names of these options, for messages.
-    pub(super) options: (&'static str, &'static str),
+    pub(crate) options: (&'static str, &'static str),
     /// Its version; if absent, that of its label.
-    pub(super) version: Option<u32>,
+    pub(crate) version: Option<u32>,
 }
 
 impl ToSeal<'_> {
     /// Refuses a file that cannot be a program, like `flash`.
-    pub(super) fn judge(&self) -> Result<(), Failure> {
+    pub(crate) fn judge(&self) -> Result<(), Failure> {
         judge(self.program.image(), self.program.start(), self.board)
             .map_err(|fault| Failure::no_program(self.path, fault))
     }
 
     /// Adds the program's identity and version to the parameters in `sealer`.
-    pub(super) fn sealer<'s>(&self, sealer: Sealer<'s>) -> Result<Sealer<'s>, Failure> {
+    pub(crate) fn sealer<'s>(&self, sealer: Sealer<'s>) -> Result<Sealer<'s>, Failure> {
         let label = self.program.label();
         let unnamed = |what: &str, option: &str| {
             let what = format!("{}: the program has no {what} of its target device", self.path.display());
@@ -198,18 +200,18 @@ impl ToSeal<'_> {
     }
 
     /// Seals the program as it lies in flash with this key.
-    pub(super) fn seal(&self, sealer: &Sealer<'_>, key: &SigningKey) -> Result<Vec<u8>, Failure> {
+    pub(crate) fn seal(&self, sealer: &Sealer<'_>, key: &SigningKey) -> Result<Vec<u8>, Failure> {
         sealer.seal(&self.program.flash_image(), key).map_err(|fault| self.fault(&fault))
     }
 
     fn fault(&self, fault: &SealFault) -> Failure {
-        Failure::file(self.path, &fault.to_string())
+        Failure::file(self.path, fault)
     }
 }
 
 /// The form in which a sealed image is written.
 #[derive(Clone, Copy)]
-pub(super) enum Form {
+pub(crate) enum Form {
     /// Unchanged.
     Plain,
     /// In blocks of at most `size` bytes, for a program that starts at `start`.
@@ -217,7 +219,7 @@ pub(super) enum Form {
 }
 
 /// Writes a sealed image and returns it; its signature may be missing.
-pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFile, Failure> {
+pub(crate) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFile, Failure> {
     let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(output, &refusal))?;
     match form {
         Form::Plain => write(output, file.bytes())?,
@@ -231,7 +233,7 @@ pub(super) fn put(output: &Path, image: Vec<u8>, form: Form) -> Result<SealedFil
 }
 
 /// Reports what was written.
-pub(super) fn tell(context: &Context, command: &str, output: &Path, file: &SealedFile, signed: bool) {
+pub(crate) fn report(context: &Context, output: &Path, file: &SealedFile, signed: bool) {
     let head = file.head();
     let (size, payload) = (head.size(), head.payload());
     let mut words = format!(
@@ -249,17 +251,16 @@ pub(super) fn tell(context: &Context, command: &str, output: &Path, file: &Seale
     if !signed {
         words += "; its signature is missing: --attach completes it";
     }
-    context.out.result(words, || {
+    context.result(words, || {
         let mut value = value(file);
-        value["command"] = command.into();
         value["output"] = output.display().to_string().into();
         value["signed"] = signed.into();
         value
     });
 }
 
-impl Seal {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+impl Image {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
         if let Some(signature) = &self.attach {
             return self.complete(context, path, signature);
@@ -276,7 +277,7 @@ impl Seal {
         let (firmware, _) = self.place.load(path, self.program)?;
         let done = program_of(firmware, &self.place.options(self.program)?);
         let done = done.map_err(|error| Failure::convert(error, path))?;
-        super::file::warn(context, path, &done.notes, done.left_out);
+        crate::file::warn(context, path, &done.notes, done.left_out);
         let to_seal = ToSeal {
             path,
             program: &done.program,
@@ -311,7 +312,7 @@ impl Seal {
             }
         };
         let file = put(&output, image, self.form(|| Ok(done.program.start()))?)?;
-        tell(context, "seal", &output, &file, self.tbs.is_none());
+        report(context, &output, &file, self.tbs.is_none());
         Ok(())
     }
 
@@ -319,7 +320,7 @@ impl Seal {
     fn sealer<'a>(&'a self, encrypt_for: &'a [Kek]) -> Result<Sealer<'a>, Failure> {
         let sbom = match &self.sbom {
             Some(path) => {
-                let sbom = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+                let sbom = limit::read(path).map_err(|cause| Failure::file(path, cause))?;
                 Some(hash(&sbom))
             }
             None => None,
@@ -343,7 +344,7 @@ impl Seal {
         let (firmware, _) = read::load_telling(path, None, Some(0))?;
         let image =
             RamImage::of(&firmware).ok_or_else(|| Failure::file(path, "it contains no bootloader (CBI2)"))?;
-        image.check().map_err(|fault| Failure::file(path, &format!("it {fault}")))?;
+        image.check().map_err(|fault| Failure::file(path, format_args!("it {fault}")))?;
         let encrypt_for = keys::keks(&self.encrypt)?;
         let header = image.header();
         let sealer = Sealer {
@@ -356,7 +357,7 @@ impl Seal {
             ..self.sealer(&encrypt_for)?
         };
         let sealed = sealer.seal(image.bytes(), &keys::signing_key(&self.key)?);
-        let sealed = sealed.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        let sealed = sealed.map_err(|fault| Failure::file(path, fault))?;
         let home = || {
             let home = self.place.layout()?.and_then(|layout| layout.home);
             home.map(|home| home.base).ok_or_else(|| {
@@ -367,7 +368,7 @@ impl Seal {
             })
         };
         let file = put(output, sealed, self.form(home)?)?;
-        tell(context, "seal", output, &file, true);
+        report(context, output, &file, true);
         Ok(())
     }
 
@@ -393,15 +394,15 @@ impl Seal {
             };
             self.place.start(self.program)?.ok_or_else(unknown)
         })?;
-        let file = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+        let file = limit::read(path).map_err(|cause| Failure::file(path, cause))?;
         let key = keys::public_key(&self.key)?;
         let why = "is not a signature: it must have 64 bytes, as openssl pkeyutl -sign -rawin writes them";
         let bytes: Option<[u8; 64]> = bytes_of(signature, 1024)?.try_into().ok();
         let bytes = bytes.ok_or_else(|| Failure::file(signature, why))?;
         let image = Unsigned::of_file(file, key).and_then(|unsigned| unsigned.attach(&bytes));
-        let image = image.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        let image = image.map_err(|fault| Failure::file(path, fault))?;
         let file = put(&output, image, form)?;
-        tell(context, "seal", &output, &file, true);
+        report(context, &output, &file, true);
         Ok(())
     }
 }

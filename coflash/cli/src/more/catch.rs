@@ -1,4 +1,4 @@
-//! `coflash catch`: holds a device in its bootloader as soon as it has power.
+//! `coflash more catch`: holds a device in its bootloader as soon as it has power.
 
 use std::time::Duration;
 
@@ -7,10 +7,10 @@ use coflash_core::update::event::{Event, Phase};
 use coflash_core::update::{catch, CatchOptions, Caught};
 use serde_json::json;
 
-use super::context::Context;
-use super::device::Device;
-use super::output::Failure;
-use super::values::milliseconds;
+use crate::context::Context;
+use crate::device::Device;
+use crate::output::Failure;
+use crate::values::milliseconds;
 
 /// Waits until a device is switched on, and holds it in its bootloader.
 ///
@@ -22,7 +22,7 @@ use super::values::milliseconds;
 /// The command cannot catch a device whose program was confirmed once: that program starts at once.
 /// Use the device's entry strap instead.
 #[derive(Debug, Args)]
-pub(super) struct Catch {
+pub(crate) struct Catch {
     #[command(flatten)]
     device: Device,
 
@@ -37,32 +37,26 @@ pub(super) struct Catch {
 
 /// How long to wait.
 #[derive(Debug, Args)]
-pub(super) struct Limit {
+pub(crate) struct Limit {
     /// Give up after this time, in milliseconds. Without it, Ctrl-C ends the wait.
     #[arg(long, value_parser = milliseconds, value_name = "MS")]
     within: Option<Duration>,
 }
 
 impl Limit {
-    pub(super) fn is_set(&self) -> bool {
+    pub(crate) fn is_set(&self) -> bool {
         self.within.is_some()
     }
 }
 
 impl Catch {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        run(context, "catch", &self.device, &self.limit, self.any)
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+        run(context, &self.device, &self.limit, self.any)
     }
 }
 
-/// Catches a device for the command with this name.
-pub(super) fn run(
-    context: &Context,
-    command: &str,
-    device: &Device,
-    limit: &Limit,
-    any: bool,
-) -> Result<(), Failure> {
+/// Catches a device.
+pub(crate) fn run(context: &Context, device: &Device, limit: &Limit, any: bool) -> Result<(), Failure> {
     let mut link = context.link()?;
     let mut session = device.session(&mut link)?;
     if any && !session.hears_the_bus() {
@@ -91,9 +85,8 @@ pub(super) fn run(
             "a device without a node-ID started, after {seconds:.1} s: give it one with coflash lss fastscan --assign"
         ),
     };
-    context.out.result(words, || {
+    context.result(words, || {
         json!({
-            "command": command,
             "node": node.map(canopen::NodeId::get),
             "device_type": running.map(|running| running.0),
             "seconds": (seconds * 1000.0).round() / 1000.0,

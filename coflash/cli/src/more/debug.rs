@@ -1,4 +1,4 @@
-//! `coflash debug`: memory and breakpoints of a device on the bench.
+//! `coflash more debug`: memory and breakpoints of a device on the bench.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,11 +11,11 @@ use coflash_core::file::{limit, Place};
 use coflash_core::Error;
 use serde_json::{json, Value};
 
-use super::context::Context;
-use super::device::Device;
-use super::output::Failure;
-use super::output_file;
-use super::values::{milliseconds, number};
+use crate::context::Context;
+use crate::device::Device;
+use crate::output::Failure;
+use crate::output_file;
+use crate::values::{milliseconds, number};
 
 /// Reads and writes memory, sets breakpoints and steps a device on the bench.
 ///
@@ -24,16 +24,16 @@ use super::values::{milliseconds, number};
 // The options that name the device are also accepted after the subcommand.
 #[derive(Debug, Args)]
 #[command(mut_args(|argument| argument.global(true)))]
-pub(super) struct Debug {
+pub(crate) struct Debug {
     #[command(subcommand)]
-    what: What,
+    command: Command,
 
     #[command(flatten)]
     device: Device,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum Command {
     /// Read memory or peripheral registers.
     Read(Read),
     /// Write RAM or peripheral registers.
@@ -41,7 +41,7 @@ enum What {
     /// Set a breakpoint and wait for it; without an address, list the breakpoints.
     Break(Break),
     /// Let a stopped program continue.
-    Continue(Continue),
+    Continue(Wait),
     /// Let a stopped program execute one instruction.
     Step,
     /// Stop the program, wherever it is.
@@ -99,12 +99,6 @@ struct Break {
 }
 
 #[derive(Debug, Args)]
-struct Continue {
-    #[command(flatten)]
-    wait: Wait,
-}
-
-#[derive(Debug, Args)]
 struct Wait {
     /// Wait for the program to stop, for at most this many milliseconds.
     #[arg(long, value_parser = milliseconds, value_name = "MS")]
@@ -125,19 +119,18 @@ struct Done {
 }
 
 impl Debug {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let node = session.node();
-        let outcome = self.what.run(&mut Debugger::new(&mut session));
+        let outcome = self.command.run(&mut Debugger::new(&mut session));
         let Done { words, value } = match outcome {
             Ok(done) => done,
             Err(Trouble::Device(error)) => return Err(Failure::diagnosed(error, &mut session)),
             Err(Trouble::Here(failure)) => return Err(failure),
         };
-        context.out.result(format_args!("node {node}: {words}"), || {
+        context.result(format_args!("node {node}: {words}"), || {
             let mut value = value;
-            value["command"] = "debug".into();
             value["node"] = node.get().into();
             value
         });
@@ -163,13 +156,13 @@ impl From<Failure> for Trouble {
     }
 }
 
-impl What {
+impl Command {
     fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Trouble> {
         match self {
             Self::Read(read) => read.run(debugger),
             Self::Write(write) => write.run(debugger),
             Self::Break(at) => at.run(debugger),
-            Self::Continue(Continue { wait }) => {
+            Self::Continue(wait) => {
                 stopped_program(debugger)?;
                 debugger.resume()?;
                 match wait.wait {
@@ -201,8 +194,11 @@ impl What {
 
 fn stopped_program(debugger: &mut Debugger<'_, '_>) -> Result<Registers, Trouble> {
     debugger.registers()?.ok_or_else(|| {
-        Failure::usage("the program is not stopped", "stop it with coflash debug stop, or set a breakpoint")
-            .into()
+        Failure::usage(
+            "the program is not stopped",
+            "stop it with coflash more debug stop, or set a breakpoint",
+        )
+        .into()
     })
 }
 
@@ -281,7 +277,7 @@ impl Break {
             (Some(address), true) => {
                 if !debugger.clear(address)? {
                     let what = format!("there is no breakpoint at {address:08X}h");
-                    return Err(Failure::usage(what, "list them with coflash debug break").into());
+                    return Err(Failure::usage(what, "list them with coflash more debug break").into());
                 }
             }
             (None, false) => {}
@@ -310,7 +306,7 @@ fn refused(address: u32, why: NoBreakpoint) -> Failure {
         ),
         NoBreakpoint::Full => Failure::usage(
             format!("all {BREAKPOINTS} breakpoints are taken"),
-            "remove one with coflash debug break ADDRESS --clear",
+            "remove one with coflash more debug break ADDRESS --clear",
         ),
         NoBreakpoint::Disabled => Failure::usage(
             "the device does not stop at breakpoints",

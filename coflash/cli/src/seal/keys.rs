@@ -1,4 +1,4 @@
-//! `coflash key`: keys for sealed images, and certificates of signing keys.
+//! `coflash seal keys`: keys for sealed images, and certificates of signing keys.
 
 use std::path::{Path, PathBuf};
 
@@ -9,11 +9,11 @@ use coflash_core::file::sealed::{Certificate, Kek, KeyFault, PublicKey, Role, Si
 use seal::wire::{self, CERTIFICATE, CERTIFICATE_MAGIC};
 use serde_json::json;
 
-use super::context::Context;
-use super::objects::bytes_of;
-use super::output::Failure;
-use super::output_file::{exists, write, write_secret, LARGEST_KEY};
-use super::values::number;
+use crate::context::Context;
+use crate::objects::bytes_of;
+use crate::output::Failure;
+use crate::output_file::{exists, write, write_secret, LARGEST_KEY};
+use crate::values::number;
 
 /// Makes keys for sealed images, certifies them, and shows them.
 ///
@@ -21,7 +21,7 @@ use super::values::number;
 /// key-encryption key (kek) decrypts encrypted programs; devices hold it, so it is as secret as the
 /// private keys.
 #[derive(Debug, Args)]
-pub(super) struct Key {
+pub(crate) struct Keys {
     #[command(subcommand)]
     job: Job,
 }
@@ -127,7 +127,7 @@ struct Show {
 
 /// The contents of a sealed device's key block.
 #[derive(Debug, Args)]
-pub(super) struct KeyBlock {
+pub(crate) struct KeyBlock {
     /// The public key of a root; give the option once for each root.
     #[arg(long, value_name = "FILE", required = true)]
     root: Vec<PathBuf>,
@@ -139,34 +139,34 @@ pub(super) struct KeyBlock {
 
     /// The lowest security counter that the device accepts, for every program.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    pub(super) counter: u32,
+    pub(crate) counter: u32,
 
     /// The lowest epoch of a certificate that the device accepts.
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0")]
-    pub(super) epoch: u32,
+    pub(crate) epoch: u32,
 
     /// Mark the device for tests: it also accepts programs signed with test keys.
     #[arg(long)]
-    pub(super) for_tests: bool,
+    pub(crate) for_tests: bool,
 }
 
 impl KeyBlock {
     /// The keys in the named files: roots and key-encryption keys.
-    pub(super) fn keys(&self) -> Result<(Vec<PublicKey>, Vec<Kek>), Failure> {
+    pub(crate) fn keys(&self) -> Result<(Vec<PublicKey>, Vec<Kek>), Failure> {
         let roots = self.root.iter().map(|path| public_key(path)).collect::<Result<_, Failure>>()?;
         Ok((roots, keks(&self.kek)?))
     }
 }
 
 /// Parses 16 bytes in hexadecimal digits. The error does not repeat the value, which is secret.
-pub(super) fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
+pub(crate) fn value_of_128_bits(text: &str) -> Result<[u8; 16], String> {
     let digits = text.strip_prefix("0x").unwrap_or(text);
     let bytes = hexadecimal(digits).and_then(|bytes| bytes.try_into().ok());
     bytes.ok_or_else(|| "it must have 32 hexadecimal digits".to_string())
 }
 
-impl Key {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+impl Keys {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         match &self.job {
             Job::New(new) => new.run(context),
             Job::Certify(certify) => certify.run(context),
@@ -211,9 +211,8 @@ impl New {
             .map_or_else(String::new, |public| format!(", its public key in {}", public.display()));
         let kind = if is_kek { "key-encryption" } else { name };
         let words = format!("{}: {kind} key {id:08X}h{beside}; keep it secret", output.display());
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "key new",
                 "role": name,
                 "id": id,
                 "output": output.display().to_string(),
@@ -248,9 +247,8 @@ impl Certify {
         let output = self.output.clone().unwrap_or_else(|| self.key.with_extension("cert"));
         write(&output, &bytes)?;
         let words = format!("{}: {}", output.display(), CertificateWords(wire::Certificate(&bytes)));
-        context.out.result(words, || {
+        context.result(words, || {
             let mut value = certificate_value(wire::Certificate(&bytes));
-            value["command"] = "key certify".into();
             value["output"] = output.display().to_string().into();
             value
         });
@@ -266,9 +264,8 @@ impl Show {
             let bytes = certificate(path)?;
             let words = CertificateWords(wire::Certificate(&bytes));
             let words = format!("{}: certificate: {words} (its signature is not checked)", path.display());
-            context.out.result(words, || {
+            context.result(words, || {
                 let mut value = certificate_value(wire::Certificate(&bytes));
-                value["command"] = "key show".into();
                 value["kind"] = "certificate".into();
                 value
             });
@@ -288,16 +285,16 @@ impl Show {
         };
         let public = public.map(|key| digits(&key.bytes()));
         let behind = public.as_ref().map_or_else(String::new, |public| format!(", public key {public}"));
-        context.out.result(
+        context.result(
             format!("{}: {kind} {id:08X}h{behind}", path.display()),
-            || json!({ "command": "key show", "kind": kind, "id": id, "public_key": public }),
+            || json!({ "kind": kind, "id": id, "public_key": public }),
         );
         Ok(())
     }
 }
 
 /// The JSON value of a certificate.
-pub(super) fn certificate_value(certificate: wire::Certificate<'_>) -> serde_json::Value {
+pub(crate) fn certificate_value(certificate: wire::Certificate<'_>) -> serde_json::Value {
     json!({
         "role": role_name(certificate.role()),
         "epoch": certificate.epoch(),
@@ -316,30 +313,29 @@ fn text(path: &Path) -> Result<String, Failure> {
 }
 
 /// The private key in a file.
-pub(super) fn signing_key(path: &Path) -> Result<SigningKey, Failure> {
-    SigningKey::from_pem(&text(path)?).map_err(|fault| Failure::file(path, &fault.to_string()))
+pub(crate) fn signing_key(path: &Path) -> Result<SigningKey, Failure> {
+    SigningKey::from_pem(&text(path)?).map_err(|fault| Failure::file(path, fault))
 }
 
 /// The public key in a file. The file may also hold a private key.
-pub(super) fn public_key(path: &Path) -> Result<PublicKey, Failure> {
+pub(crate) fn public_key(path: &Path) -> Result<PublicKey, Failure> {
     let text = text(path)?;
     match SigningKey::from_pem(&text) {
         Ok(key) => Ok(key.public()),
-        Err(_) => PublicKey::from_pem(&text).map_err(|fault| Failure::file(path, &fault.to_string())),
+        Err(_) => PublicKey::from_pem(&text).map_err(|fault| Failure::file(path, fault)),
     }
 }
 
 /// The key-encryption keys in files.
-pub(super) fn keks(paths: &[PathBuf]) -> Result<Vec<Kek>, Failure> {
-    let kek =
-        |path: &PathBuf| Kek::from_pem(&text(path)?).map_err(|fault| Failure::file(path, &fault.to_string()));
+pub(crate) fn keks(paths: &[PathBuf]) -> Result<Vec<Kek>, Failure> {
+    let kek = |path: &PathBuf| Kek::from_pem(&text(path)?).map_err(|fault| Failure::file(path, fault));
     paths.iter().map(kek).collect()
 }
 
 /// Reads a certificate. Its contents are checked where it is used.
-pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
+pub(crate) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
     let bytes = bytes_of(path, LARGEST_KEY)?;
     let bytes = Some(bytes).filter(|bytes| bytes.starts_with(&CERTIFICATE_MAGIC));
-    let why = "is not a certificate: coflash key certify makes one";
+    let why = "is not a certificate: coflash seal keys certify makes one";
     bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
 }

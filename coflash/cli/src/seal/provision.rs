@@ -1,4 +1,4 @@
-//! `coflash provision`: writes keys into a bootloader, for production.
+//! `coflash seal provision`: writes keys into a bootloader, for production.
 
 use std::path::PathBuf;
 
@@ -10,13 +10,15 @@ use coflash_core::file::sealed::provision::{protected_sectors, provision};
 use coflash_core::file::sealed::{key_block, Kek, PublicKey};
 use serde_json::json;
 
-use super::context::Context;
-use super::file::{Input, MemoryMap};
-use super::keys::KeyBlock;
-use super::output::Failure;
-use super::output_file::write_secret;
+use crate::context::Context;
+use crate::file::{Input, MemoryMap};
+use crate::output::Failure;
+use crate::output_file::write_secret;
+use crate::seal::keys::KeyBlock;
 
-/// Writes keys into a bootloader image, so that its devices accept only sealed programs.
+/// Writes keys into a bootloader, for production.
+///
+/// Its devices accept only sealed programs.
 ///
 /// There is room for two roots and three key-encryption keys. A debug probe writes the result into
 /// the device in production. With key-encryption keys in it, the file is as secret as the keys;
@@ -25,7 +27,7 @@ use super::output_file::write_secret;
 /// The output names the sectors that belong under write protection: with renewal the first one
 /// alone, because the home of the bootloader's RAM image has to stay writable.
 #[derive(Debug, Args)]
-pub(super) struct Provision {
+pub(crate) struct Provision {
     #[command(flatten)]
     input: Input,
 
@@ -45,7 +47,7 @@ pub(super) struct Provision {
 }
 
 impl Provision {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
         let unnamed = || Failure::usage("the address of the keys is unknown", "give --board");
         let layout = self.map.layout()?.ok_or_else(unnamed)?;
@@ -59,7 +61,7 @@ impl Provision {
             let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
-        let bytes = super::file::bytes(path)?;
+        let bytes = crate::file::bytes(path)?;
         let format = Format::detect(&bytes).or(Some(Format::Raw));
         let firmware = read::read(&bytes, format, Some(layout.bootloader.base));
         let Firmware::Image(image) = firmware.map_err(|error| error.of(path.display()))? else {
@@ -68,9 +70,8 @@ impl Provision {
         let (roots, keks) = self.keys.keys()?;
         let KeyBlock { counter, epoch, for_tests, .. } = self.keys;
         let block = key_block(&roots, &keks, counter, epoch, for_tests)
-            .map_err(|fault| Failure::usage(fault.to_string(), "see coflash provision --help"))?;
-        let made =
-            provision(&image, layout, &block).map_err(|fault| Failure::file(path, &fault.to_string()))?;
+            .map_err(|fault| Failure::usage(fault.to_string(), "see coflash seal provision --help"))?;
+        let made = provision(&image, layout, &block).map_err(|fault| Failure::file(path, fault))?;
         write_secret(&output, ihex::emit(&made), self.overwrite)?;
         let root_ids: Vec<u32> = roots.iter().map(PublicKey::id).collect();
         let kek_ids: Vec<u32> = keks.iter().map(Kek::id).collect();
@@ -95,9 +96,8 @@ impl Provision {
             if for_tests { ", for tests" } else { "" },
             sector_list(protect),
         );
-        context.out.result(words, || {
+        context.result(words, || {
             json!({
-                "command": "provision",
                 "output": output.display().to_string(),
                 "board": layout.board,
                 "address": layout.key_block().base,

@@ -1,0 +1,54 @@
+//! `coflash more`: the commands that few people need every day.
+
+pub(crate) mod catch;
+#[cfg(feature = "conform")]
+mod conform;
+mod debug;
+mod generate;
+mod report;
+mod shell;
+
+use clap::Subcommand;
+
+use crate::context::Context;
+use crate::output::Failure;
+use crate::program::{Release, Status, Withdraw};
+
+/// Single steps, debugger, reports, checks, shell, man.
+#[derive(Debug, Subcommand)]
+pub(crate) enum More {
+    Status(Status),
+    Catch(catch::Catch),
+    Release(Release),
+    Withdraw(Withdraw),
+    Debug(debug::Debug),
+    Report(report::Report),
+    Shell(shell::Shell),
+    #[cfg(feature = "conform")]
+    Conform(conform::Conform),
+    Completions(generate::Completions),
+    Man(generate::Manual),
+}
+
+impl More {
+    /// Whether the command needs a bus. A bad one is one of the faults that a report is for.
+    pub(crate) fn takes_a_bus(&self) -> bool {
+        !matches!(self, Self::Report(_) | Self::Completions(_) | Self::Man(_))
+    }
+
+    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+        match self {
+            Self::Status(status) => status.run(context),
+            Self::Catch(catch) => catch.run(context),
+            Self::Release(release) => release.run(context),
+            Self::Withdraw(withdraw) => withdraw.run(context),
+            Self::Debug(debug) => debug.run(context),
+            Self::Report(report) => report.run(context),
+            Self::Shell(shell) => shell.run(context),
+            #[cfg(feature = "conform")]
+            Self::Conform(conform) => conform.run(context),
+            Self::Completions(completions) => completions.run(),
+            Self::Man(manual) => manual.run(context),
+        }
+    }
+}
