@@ -613,7 +613,7 @@ fn nothing_that_comes_in_between_gets_past_the_signature() {
     for right in [false, true] {
         for (what, action) in actions {
             for at in (0..=file.len()).step_by(60) {
-                for steps in [0, 3, 40, usize::MAX] {
+                for steps in [0, 3, 40, u32::MAX] {
                     let told = format!("{what} behind {at} bytes and {steps} steps, rights: {right}");
                     let device = device.copy();
                     device.run(|host| {
@@ -623,7 +623,7 @@ fn nothing_that_comes_in_between_gets_past_the_signature() {
                         host.clear(1);
                         let mut sent = host.begin(1, &file[..at], 7);
                         match steps {
-                            usize::MAX => host.settle(),
+                            u32::MAX => host.settle(),
                             steps => host.steps(steps),
                         }
                         action(host);
