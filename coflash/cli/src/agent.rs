@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_agent::{run, Buses, Config, Ended, Kind, Options, Message};
+use coflash_agent::{run, Buses, Config, Ended, Kind, Message, Options};
 use coflash_core::device::legacy;
 use coflash_core::file::limit::read_text;
 use serde_json::json;

@@ -215,7 +215,8 @@ fn flash_each(
         hub::Conversation { node: plan.job.node, channel: plan.channel, act }
     };
     // Devices of a group have nothing else to do than to answer.
-    let limits = hub::Options { at_once, answer: options.timing.sdo / 2, cancelled: options.cancelled.clone() };
+    let limits =
+        hub::Options { at_once, answer: options.timing.sdo / 2, cancelled: options.cancelled.clone() };
     hub::run(adapter, jobs.iter().map(conversation).collect(), &limits)
 }
 

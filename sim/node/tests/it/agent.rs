@@ -10,7 +10,7 @@ use std::time::Duration;
 use crate::bus::{self, Coflash, Folder, Nodes};
 use crate::machine;
 use coboot_can::Link;
-use coflash_agent::{run, Buses, Config, Ended, Options, Message, Times};
+use coflash_agent::{run, Buses, Config, Ended, Message, Options, Times};
 use kit::hawkbit::{Action, File, Server};
 
 const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];

@@ -8,7 +8,7 @@ use canopen::{Address, CobId};
 use super::{Access, Session};
 use crate::device::doing::Doing;
 use crate::device::error::Error;
-use coboot_can::adapter::{Group, Delivery};
+use coboot_can::adapter::{Delivery, Group};
 
 impl Session<'_> {
     fn group(&mut self) -> Option<&mut dyn Group> {
