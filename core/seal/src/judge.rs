@@ -6,8 +6,8 @@
 
 use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
 use crate::wire::{
-    flag, role, tag, word, Certificate, Fault, Head, Requirements, BOOTLOADER, CERTIFICATE, ED25519, FIXED,
-    FORMAT, MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
+    flag, role, tag, word, Fault, Head, Requirements, BOOTLOADER, CERTIFICATE, ED25519, FIXED, FORMAT,
+    MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
 };
 
 /// The device that has received the image.
@@ -55,65 +55,20 @@ pub struct Needs {
 /// # Errors
 /// The reason why the device refuses it.
 pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
-    if !is_possible(head) {
-        return Err(Fault::Format);
-    }
-    let (needs, recipient) = records(head, device)?;
-    check_target(head, needs, device)?;
-    if head.size() > device.room {
-        return Err(Fault::Address);
-    }
-    if head.counter() < device.counter {
-        return Err(Fault::Rollback);
-    }
-    let has = |which: u8| head.flags() & which != 0;
-    let mut epoch = device.epoch;
-    let mut test = has(flag::TEST);
-    let root = match head.certificate() {
-        Some(certificate) => {
-            test |= certificate.role() == role::TEST;
-            if !holds(certificate, head.counter(), device) {
-                return Err(Fault::Signature);
-            }
-            if certificate.epoch() < epoch {
-                return Err(Fault::Rollback);
-            }
-            epoch = certificate.epoch();
-            key_block::find(device.keys, ROOTS, ROOT_COUNT, certificate.root_id())
-        }
-        // A root may sign a program directly.
-        None => (ROOTS..KEKS).step_by(key_block::KEY).find(|at| {
-            let id = word(device.keys, *at);
-            id != 0 && head.signature(id).is_some()
-        }),
-    };
-    let Some(root) = root else { return Err(Fault::Key) };
-    let for_tests = word(device.keys, key_block::FLAGS) & FOR_TESTS != 0;
-    if test && !for_tests || has(flag::ENCRYPTED) && recipient.is_none() {
-        return Err(Fault::Key);
-    }
-    let recipient = recipient.filter(|_| has(flag::ENCRYPTED));
-    Ok(Needs { root, epoch, recipient })
-}
-
-/// Whether sizes and flags are those of an image in this format.
-fn is_possible(head: Head<'_>) -> bool {
-    let has = |which: u8| head.flags() & which != 0;
+    let flags = head.flags();
+    let chunk = head.chunk();
     let size = head.size();
-    head.flags() & !flag::KNOWN == 0
-        && (MIN_CHUNK..=MAX_CHUNK).contains(&head.chunk())
+    let has = |which: u8| flags & which != 0;
+    let possible = flags & !flag::KNOWN == 0
+        && (MIN_CHUNK..=MAX_CHUNK).contains(&chunk)
         && head.format() <= FORMAT
         && size > 0
         && head.payload() > 0
         && (has(flag::COMPRESSED) || head.payload() == size)
-        && (has(flag::COMPRESSED) || !has(flag::DICTIONARY))
-}
-
-/// What the records say: what a bootloader needs, and [`Needs::recipient`].
-fn records(
-    head: Head<'_>,
-    device: &Device<'_>,
-) -> Result<(Option<Requirements>, Option<(usize, usize)>), Fault> {
+        && (has(flag::COMPRESSED) || !has(flag::DICTIONARY));
+    if !possible {
+        return Err(Fault::Format);
+    }
     let is_bootloader = device.program == BOOTLOADER;
     let mut needs = None;
     let mut recipient = None;
@@ -130,25 +85,23 @@ fn records(
         }
         at += record.len();
     }
-    Ok((needs, recipient))
-}
-
-/// Checks that the image is for this device, and for this one of its programs.
-fn check_target(head: Head<'_>, needs: Option<Requirements>, device: &Device<'_>) -> Result<(), Fault> {
     if head.vendor_id() != device.vendor_id {
         return Err(Fault::WrongVendor);
     }
-    let has = |which: u8| head.flags() & which != 0;
-    let (unique_id, hardware) = (head.unique_id(), head.hardware());
+    let unique_id = head.unique_id();
+    let hardware = head.hardware();
     let fits = head.product_code() == device.product_code
         && head.program() == device.program
         && has(flag::DATA) == device.is_data
         && (unique_id == [0; 12] || unique_id == device.unique_id)
         && (hardware == 0 || hardware >> (device.revision & 31) & 1 == 1);
+    if !fits {
+        return Err(Fault::WrongProduct);
+    }
     // A program that writes flash could write a bootloader that nobody has verified.
     let writes = has(flag::WRITES_FLASH) && device.has.is_some();
-    let runs = match (needs, device.has) {
-        _ if device.program != BOOTLOADER => !writes,
+    let holds = match (needs, device.has) {
+        _ if !is_bootloader => !writes,
         (Some(needs), Some(has_it)) => {
             needs.board == has_it.board
                 && needs.services <= has_it.services
@@ -158,19 +111,66 @@ fn check_target(head: Head<'_>, needs: Option<Requirements>, device: &Device<'_>
         }
         _ => false,
     };
-    (fits && runs).then_some(()).ok_or(Fault::WrongProduct)
+    if !holds {
+        return Err(Fault::WrongProduct);
+    }
+    if size > device.room {
+        return Err(Fault::Address);
+    }
+    let counter = head.counter();
+    if counter < device.counter {
+        return Err(Fault::Rollback);
+    }
+    judge_signer(head, device, flags, counter, recipient)
 }
 
-/// Whether the key of a certificate may sign an image with this security counter for the device.
-fn holds(certificate: Certificate<'_>, counter: u32, device: &Device<'_>) -> bool {
-    let own = certificate.product_code();
-    usize::from(certificate.size()) == CERTIFICATE
-        && u16::from(certificate.algorithm()) == ED25519
-        && may_sign(certificate.role(), device.program == BOOTLOADER)
-        && certificate.vendor_id() == device.vendor_id
-        && (own == 0 || own == device.product_code)
-        && (certificate.lowest()..=certificate.highest()).contains(&counter)
-        && certificate.reserved() == [0; RESERVED]
+/// Checks the certificate of an image with these flags and this security counter, and that the device has the keys.
+/// `recipient` is that of [`Needs`].
+fn judge_signer(
+    head: Head<'_>,
+    device: &Device<'_>,
+    flags: u8,
+    counter: u32,
+    recipient: Option<(usize, usize)>,
+) -> Result<Needs, Fault> {
+    let has = |which: u8| flags & which != 0;
+    let for_tests = word(device.keys, key_block::FLAGS) & FOR_TESTS != 0;
+    let mut epoch = device.epoch;
+    let mut test = has(flag::TEST);
+    let mut root_id = 0;
+    if let Some(certificate) = head.certificate() {
+        test |= certificate.role() == role::TEST;
+        let own = certificate.product_code();
+        let holds = usize::from(certificate.size()) == CERTIFICATE
+            && u16::from(certificate.algorithm()) == ED25519
+            && may_sign(certificate.role(), device.program == BOOTLOADER)
+            && certificate.vendor_id() == device.vendor_id
+            && (own == 0 || own == device.product_code)
+            && (certificate.lowest()..=certificate.highest()).contains(&counter)
+            && certificate.reserved() == [0; RESERVED];
+        if !holds {
+            return Err(Fault::Signature);
+        }
+        if certificate.epoch() < epoch {
+            return Err(Fault::Rollback);
+        }
+        epoch = certificate.epoch();
+        root_id = certificate.root_id();
+    }
+    let mut root = key_block::find(device.keys, ROOTS, ROOT_COUNT, root_id);
+    if head.certificate().is_none() {
+        // A root may sign a program directly.
+        root = (ROOTS..KEKS).step_by(key_block::KEY).find(|at| {
+            let id = word(device.keys, *at);
+            id != 0 && head.signature(id).is_some()
+        });
+    }
+    let Some(root) = root else { return Err(Fault::Key) };
+    if test && !for_tests || has(flag::ENCRYPTED) && recipient.is_none() {
+        return Err(Fault::Key);
+    }
+    let recipient = recipient.filter(|_| has(flag::ENCRYPTED));
+    Ok(Needs { root, epoch, recipient })
 }
 
 /// Whether a key with this role signs bootloaders, or programs.

@@ -135,45 +135,29 @@ pub fn array<const N: usize>(bytes: &[u8], at: usize) -> [u8; N] {
     bytes.get(at..at + N).and_then(|bytes| bytes.try_into().ok()).unwrap_or([0; N])
 }
 
-/// A field of a fixed size.
-trait Field {
-    fn read(bytes: &[u8], at: usize) -> Self;
-}
-
-impl Field for u8 {
-    fn read(bytes: &[u8], at: usize) -> Self {
-        bytes[at]
-    }
-}
-
-impl Field for u16 {
-    fn read(bytes: &[u8], at: usize) -> Self {
-        half(bytes, at)
-    }
-}
-
-impl Field for u32 {
-    fn read(bytes: &[u8], at: usize) -> Self {
-        word(bytes, at)
-    }
-}
-
-impl Field for u64 {
-    fn read(bytes: &[u8], at: usize) -> Self {
-        Self::from_le_bytes(array(bytes, at))
-    }
-}
-
-impl<const N: usize> Field for [u8; N] {
-    fn read(bytes: &[u8], at: usize) -> Self {
-        array(bytes, at)
-    }
+/// Reads a field of this type.
+macro_rules! read {
+    (u8, $bytes:expr, $at:literal) => {
+        $bytes[$at]
+    };
+    (u16, $bytes:expr, $at:literal) => {
+        half($bytes, $at)
+    };
+    (u32, $bytes:expr, $at:literal) => {
+        word($bytes, $at)
+    };
+    (u64, $bytes:expr, $at:literal) => {
+        u64::from_le_bytes(array($bytes, $at))
+    };
+    ($array:tt, $bytes:expr, $at:literal) => {
+        array($bytes, $at)
+    };
 }
 
 /// The fields of a record: the method that reads each, and its offset in bytes, with which a tool writes it.
 macro_rules! fields {
     ($Record:ident, $offsets:ident:
-        $($(#[$about:meta])* $name:ident $NAME:ident: $type:ty = $at:literal;)*
+        $($(#[$about:meta])* $name:ident $NAME:ident: $type:tt = $at:literal;)*
         $(; $($(#[$of:meta])* $hash:ident $HASH:ident = $from:literal;)*)?
     ) => {
         impl $Record<'_> {
@@ -181,7 +165,7 @@ macro_rules! fields {
                 $(#[$about])*
                 #[must_use]
                 pub fn $name(self) -> $type {
-                    Field::read(self.0, $at)
+                    read!($type, self.0, $at)
                 }
             )*
         }

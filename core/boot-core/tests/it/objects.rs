@@ -873,6 +873,21 @@ fn a_password_waits_for_what_is_acknowledged() {
     rig.unlock(1).unwrap();
 }
 
+/// A password begins anew: a program that was streamed before it is not fresh, and no failure is left.
+#[test]
+fn a_password_leaves_nothing_of_the_session_before() {
+    let mut rig = Rig::new(&LIFT_1, 4096);
+    rig.install(1, &raw(&LIFT_1, 1, 600));
+    rig.unlock(1).unwrap();
+    rig.command(1, START).unwrap();
+    let request = rig.node.take_boot_request();
+    assert!(matches!(request, Some(BootRequest::Start(1) | BootRequest::Trial(1))), "{request:?}");
+    assert!(rig.send(1, &kit::rig::block(7, LIFT_1.region(1).base, &[0; 8])).is_err());
+    assert_ne!(rig.status(1), 0);
+    rig.unlock(1).unwrap();
+    assert_eq!(rig.status(1), 0);
+}
+
 /// A lift takes another program without CLEAR, the others do not.
 #[test]
 fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
