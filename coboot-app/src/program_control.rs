@@ -505,7 +505,7 @@ mod tests {
     }
 
     /// A start by a bootloader with this number.
-    fn told(bootloader_number: u8) -> BootInfo {
+    fn boot_info(bootloader_number: u8) -> BootInfo {
         BootInfo {
             node_id: 5,
             bit_rate: 125_000,
@@ -592,7 +592,7 @@ mod tests {
         }
         let none = Abort(0x0609_0011);
         for (programs, number) in [(1, 2), (1, 3), (2, 3)] {
-            let start = Start { fresh: true, ..Start::new(Some(told(number)), DEFAULTS) };
+            let start = Start { fresh: true, ..Start::new(Some(boot_info(number)), DEFAULTS) };
             let mut control = ProgramControl::new(&start, layout(programs.into()), 0xCAFE);
             for (index, sub, value) in [
                 (0x2007, 1, u64::from(number)),

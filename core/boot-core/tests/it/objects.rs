@@ -691,6 +691,12 @@ fn data_of_the_application_are_any_bytes() {
         rig.command(2, START).unwrap();
         rig.settle();
         assert_eq!((rig.status(2), rig.node.take_boot_request()), (0x02, None), "NOVALPROG");
+        // Nor does a START that comes before they are verified.
+        rig.unlock(2).unwrap();
+        rig.send(2, data).unwrap();
+        assert_eq!(rig.command(2, START), Err(MAN_BUSY));
+        rig.settle();
+        assert_eq!((rig.state(2), rig.node.take_boot_request()), (0, None));
     }
 }
 
