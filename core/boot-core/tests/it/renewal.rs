@@ -1,5 +1,7 @@
 //! The renewal of the bootloader, on the model of the flash, with the power cut at every operation.
 
+use std::sync::LazyLock;
+
 use boot_core::bootloader::{entries, entry_count, Bootloader, Choices, Config, Extras};
 use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
@@ -48,6 +50,10 @@ const FORMAT: u32 = 0x04;
 const NO_VALID_PROGRAM: u32 = 0x02;
 const WRITE: u32 = 0x0A;
 const SECURED: u32 = 0x0E;
+
+/// The image at home, and the one that takes its place.
+static OLD: LazyLock<Vec<u8>> = LazyLock::new(|| image(0x200, 1));
+static NEW: LazyLock<Vec<u8>> = LazyLock::new(|| image(0x300, 2));
 
 /// What remains of a device when its power is off: the flash. And what a warm reset keeps.
 struct Board {
@@ -289,11 +295,10 @@ fn an_image_is_staged_tried_confirmed_and_installed() {
 /// Each form in which 1F50h takes a program.
 #[test]
 fn every_format_is_taken() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for form in ["raw", "hex"] {
-        let mut board = Board::new(&old);
+        let mut board = Board::new(&OLD);
         let mut node = board.start();
-        let bytes = if form == "raw" { new.clone() } else { ihex::intel_hex(HOME.base, &new).into_bytes() };
+        let bytes = if form == "raw" { NEW.clone() } else { ihex::intel_hex(HOME.base, &NEW).into_bytes() };
         // As for a program: what has broken off begins anew after STOP.
         let at = Address::new(0x1F50, N);
         node.0.download_start(at, None).unwrap();
@@ -303,15 +308,14 @@ fn every_format_is_taken() {
         node.command(N, 0);
         node.send(N, &bytes).unwrap();
         assert_eq!((node.word(0x1F57), node.progress().state), (0, State::Staged), "{form}");
-        assert!(node.has_staged(&new), "{form}");
+        assert!(node.has_staged(&NEW), "{form}");
     }
 }
 
 #[test]
 fn a_trial_ends_without_anybody_there() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
+    let mut board = Board::new(&OLD);
+    board.start().stage(&NEW);
     for (ends, end) in
         [(None, TrialEnd::Late), (Some(WITHDRAW), TrialEnd::GivenUp), (Some(CLEAR), TrialEnd::GivenUp)]
     {
@@ -330,7 +334,7 @@ fn a_trial_ends_without_anybody_there() {
             }
         };
         board.leave(request);
-        assert_eq!(board.loads().0.crc, crc_of(&old));
+        assert_eq!(board.loads().0.crc, crc_of(&OLD));
         let mut node = board.start();
         let over = Progress { state: State::Staged, origin: Origin::Home, trial_end: end };
         assert_eq!(node.progress(), over);
@@ -421,8 +425,7 @@ fn a_damaged_image_is_not_staged() {
 /// A program takes the flash of the image on trial: that can no longer be confirmed, and ends as well.
 #[test]
 fn a_trial_without_its_image_ends_too() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::on_trial(&old, &new);
+    let mut board = Board::on_trial(&OLD, &NEW);
     let mut node = board.start();
     node.download(0x3400);
     assert_eq!((node.progress().state, node.progress().origin), (State::None, Origin::Trial));
@@ -437,8 +440,7 @@ fn a_trial_without_its_image_ends_too() {
 /// An image that was installed is on trial no more, whatever becomes of its record.
 #[test]
 fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::on_trial(&old, &new);
+    let mut board = Board::on_trial(&OLD, &NEW);
     let mut node = board.start();
     assert_eq!((node.command(N, CONFIRM), node.progress().state), (0, State::Installed));
     node.download(0x3400);
@@ -450,9 +452,8 @@ fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
 /// 83h in the last millisecond counts, also if its store takes longer.
 #[test]
 fn a_confirmation_just_in_time_is_not_thrown_away() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for steps in [0, 1, 4, 12, 40] {
-        let mut board = Board::on_trial(&old, &new);
+        let mut board = Board::on_trial(&OLD, &NEW);
         let mut node = board.start();
         node.0.set_time(Instant::from_millis(59_999));
         node.try_command(N, CONFIRM).unwrap();
@@ -472,8 +473,7 @@ fn a_confirmation_just_in_time_is_not_thrown_away() {
 /// A program's download that is complete is no reason to refuse a trial; one that is open is.
 #[test]
 fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::with_staged(&old, &new);
+    let mut board = Board::with_staged(&OLD, &NEW);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x1000), PROGRAM.base, 200);
@@ -494,8 +494,7 @@ fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
 /// The record of staging cannot be removed, and a program has to leave its flash alone: the error is the program's.
 #[test]
 fn a_program_whose_way_into_staging_cannot_be_stored_is_told() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::with_staged(&old, &new);
+    let mut board = Board::with_staged(&OLD, &NEW);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x3400), PROGRAM.base, 200);
@@ -508,14 +507,13 @@ fn a_program_whose_way_into_staging_cannot_be_stored_is_told() {
         node.settle();
     }
     assert_ne!(node.status(1) >> 1 & 0x7F, 0, "an error of the program");
-    assert!(node.has_staged(&new) && node.progress().state == State::Staged);
+    assert!(node.has_staged(&NEW) && node.progress().state == State::Staged);
 }
 
 /// A download of the program that has passed the start of staging does not go on over a new image.
 #[test]
 fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
+    let mut board = Board::new(&OLD);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     let mut file = block_file_at(&program_of(0x3700), PROGRAM.base, 200);
@@ -531,7 +529,7 @@ fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
     let partial: [u8; 8] = node.read(0x2006, 1);
     let end = u32::from_le_bytes(partial[4..].try_into().unwrap());
     assert!(end > STAGING.base, "{end:08X}h is before staging: the next download would not be dropped");
-    node.stage(&new);
+    node.stage(&NEW);
     board.off();
     let mut node = board.start();
     assert_eq!((node.read::<8>(0x2006, 1), node.progress().state), ([0; 8], State::Staged));
@@ -540,13 +538,12 @@ fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
 /// The last program and staging share a sector.
 #[test]
 fn a_program_that_reaches_into_staging_takes_it() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     let large = program_of(0x3400);
     for state in [State::Staged, State::Installed] {
-        let mut board = Board::new(&old);
+        let mut board = Board::new(&OLD);
         match state {
-            State::Staged => board.start().stage(&new),
-            _ => board.renew(&new),
+            State::Staged => board.start().stage(&NEW),
+            _ => board.renew(&NEW),
         }
         board.off();
         let mut node = board.start();
@@ -556,7 +553,7 @@ fn a_program_that_reaches_into_staging_takes_it() {
         let mut removed_at = None;
         for (number, block) in file.iter().enumerate() {
             node.send(1, block).unwrap();
-            let is_there = node.has_staged(&new);
+            let is_there = node.has_staged(&NEW);
             let record = node.progress().state;
             assert!(is_there || record == State::None, "{state:?}: block {number}");
             if record == State::None {
@@ -568,34 +565,32 @@ fn a_program_that_reaches_into_staging_takes_it() {
         assert_eq!(node.command(1, CONFIRM), 0);
         // Now there is no room for an image.
         assert_eq!(node.command(N, CLEAR), 0);
-        let first = &block_file_at(&new, HOME.base, 200)[0];
+        let first = &block_file_at(&NEW, HOME.base, 200)[0];
         assert_eq!(node.send(N, first), Err(AbortCode::DEVICE_STATE));
         assert_eq!(node.word(0x1F57), NOT_CLEARED | 1 << 16);
         assert_eq!(node.command(1, CLEAR), 0);
         assert_eq!(node.command(1, CLEAR), 0, "all of it");
-        node.stage(&new);
+        node.stage(&NEW);
     }
 }
 
 /// A small program leaves a spare alone, also one that ends where staging begins.
 #[test]
 fn a_program_that_ends_before_staging_leaves_it_alone() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for size in [0x1800, STAGING.base - PROGRAM.base] {
-        let mut board = Board::new(&old);
-        board.renew(&new);
+        let mut board = Board::new(&OLD);
+        board.renew(&NEW);
         board.off();
         board.install_program(size as usize);
         let mut node = board.start();
-        assert_eq!((node.progress().state, node.has_staged(&new)), (State::Installed, true), "{size:#x}");
+        assert_eq!((node.progress().state, node.has_staged(&NEW)), (State::Installed, true), "{size:#x}");
     }
 }
 
 #[test]
 fn a_damaged_home_is_repaired_from_the_spare() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.renew(&new);
+    let mut board = Board::new(&OLD);
+    board.renew(&NEW);
     board.off();
     for at in [0, 4, 0x20, 0x2FF] {
         let mut cells = board.flash.cells(HOME).to_vec();
@@ -605,7 +600,7 @@ fn a_damaged_home_is_repaired_from_the_spare() {
         let mut node = board.start();
         let Progress { state, origin, .. } = node.progress();
         assert_eq!((state, origin), (State::Installed, Origin::Spare));
-        assert_eq!(board.flash.cells(HOME)[..new.len()], new, "byte {at}");
+        assert_eq!(board.flash.cells(HOME)[..NEW.len()], **NEW, "byte {at}");
         board.off();
         assert_eq!(board.loads().1, Origin::Home);
     }
@@ -614,11 +609,10 @@ fn a_damaged_home_is_repaired_from_the_spare() {
 /// The seeded master has found it: the repair fails, and the only good image lies in staging.
 #[test]
 fn a_spare_is_kept_until_home_is_repaired() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     // The first store of the repair, and a word of home.
     for after in [1, 12] {
-        let mut board = Board::new(&old);
-        board.renew(&new);
+        let mut board = Board::new(&OLD);
+        board.renew(&NEW);
         board.off();
         let mut cells = board.flash.cells(HOME).to_vec();
         cells[0x80] = 0;
@@ -629,7 +623,7 @@ fn a_spare_is_kept_until_home_is_repaired() {
         assert_eq!(node.progress().origin, Origin::Spare);
         for program in [1, N] {
             let image = if program == N {
-                block_file_at(&old, HOME.base, 200)
+                block_file_at(&OLD, HOME.base, 200)
             } else {
                 block_file_at(&program_of(0x3400), PROGRAM.base, 200)
             };
@@ -638,13 +632,13 @@ fn a_spare_is_kept_until_home_is_repaired() {
             assert_eq!(node.status(program), BUSY, "{after}: {program}");
         }
         assert_eq!(node.command(N, CONFIRM), 0, "83h tries again");
-        assert_eq!(board.flash.cells(HOME)[..new.len()], new);
+        assert_eq!(board.flash.cells(HOME)[..NEW.len()], **NEW);
         board.off();
         let mut node = board.start();
         assert_eq!((node.progress().state, node.progress().origin), (State::Installed, Origin::Home));
         assert_eq!(node.command(N, CLEAR), 0);
         assert_eq!(
-            node.send(N, &block_file_at(&old, HOME.base, 200)[0]),
+            node.send(N, &block_file_at(&OLD, HOME.base, 200)[0]),
             Ok(()),
             "the spare is none any more"
         );
@@ -661,34 +655,32 @@ fn decay(flash: &mut ModelFlash, at: u32) {
 /// Home is the only other good bootloader: it is erased for an image that is whole, and for no other.
 #[test]
 fn an_image_that_has_decayed_since_its_start_does_not_cost_home() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for at in [0, 4, 0x20, 0x41, 0x2FF] {
-        let mut board = Board::on_trial(&old, &new);
+        let mut board = Board::on_trial(&OLD, &NEW);
         let mut node = board.start();
         decay(node.0.flash(), STAGING.base + at);
         assert_eq!(node.command(N, CONFIRM), NO_VALID_PROGRAM, "byte {at}");
         assert_eq!(node.progress().state, State::None, "byte {at}");
-        assert_eq!(board.flash.cells(HOME)[..old.len()], old, "byte {at}");
+        assert_eq!(board.flash.cells(HOME)[..OLD.len()], **OLD, "byte {at}");
         board.off();
-        board.renew(&new);
+        board.renew(&NEW);
         board.off();
-        board.check([&new, &new]);
+        board.check([&NEW, &NEW]);
     }
     // Nor does a whole one that nobody has tried, from a probe.
-    let mut board = Board::on_trial(&old, &new);
+    let mut board = Board::on_trial(&OLD, &NEW);
     let mut node = board.start();
     node.0.flash().poke(STAGING.base, &image(0x300, 3));
     assert_eq!(node.command(N, CONFIRM), NO_VALID_PROGRAM);
-    assert_eq!(board.flash.cells(HOME)[..old.len()], old);
+    assert_eq!(board.flash.cells(HOME)[..OLD.len()], **OLD);
 }
 
 /// 1F57h/n is busy until the image is installed: that is what a tool waits for. A program that is being
 /// downloaded meanwhile makes no difference.
 #[test]
 fn an_installation_is_busy_to_its_end() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for downloads in [false, true] {
-        let mut board = Board::on_trial(&old, &new);
+        let mut board = Board::on_trial(&OLD, &NEW);
         let mut node = board.start();
         if downloads {
             assert_eq!(node.command(1, CLEAR), 0);
@@ -707,10 +699,9 @@ fn an_installation_is_busy_to_its_end() {
 /// Somebody protects home while it is erased or written: 1F57h names its sector.
 #[test]
 fn a_home_that_is_protected_in_the_middle_is_named() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     // Before it is erased, and when half of it is written.
-    for until in [&[][..], &new[..0x100]] {
-        let mut board = Board::on_trial(&old, &new);
+    for until in [&[][..], &NEW[..0x100]] {
+        let mut board = Board::on_trial(&OLD, &NEW);
         let mut node = board.start();
         node.try_command(N, CONFIRM).unwrap();
         // The record that permits the erase is stored.
@@ -728,13 +719,12 @@ fn a_home_that_is_protected_in_the_middle_is_named() {
 /// And it is installed when the whole copy is what was staged: both decay while home is being written.
 #[test]
 fn a_copy_is_compared_before_it_counts_as_installed() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
     for place in [STAGING, HOME] {
-        let mut board = Board::on_trial(&old, &new);
+        let mut board = Board::on_trial(&OLD, &NEW);
         let mut node = board.start();
         node.try_command(N, CONFIRM).unwrap();
         // The first words are there, the last ones are not.
-        while node.0.flash().cells(HOME)[..0x100] != new[..0x100] {
+        while node.0.flash().cells(HOME)[..0x100] != NEW[..0x100] {
             assert_ne!(node.0.step(), Step::Idle);
         }
         let at = if place == HOME { 0x80 } else { 0x2FF };
@@ -780,12 +770,11 @@ fn an_image_from_a_probe_makes_the_record_void() {
 /// The bootloader from before an installation, written by a probe, is foreign as well.
 #[test]
 fn an_older_image_from_a_probe_makes_the_record_of_an_installed_one_void() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.renew(&new);
+    let mut board = Board::new(&OLD);
+    board.renew(&NEW);
     board.off();
     board.flash.poke(HOME.base, &[0xFF; HOME.size as usize]);
-    board.flash.poke(HOME.base, &old);
+    board.flash.poke(HOME.base, &OLD);
     let mut node = board.start();
     assert_eq!(node.progress(), Progress::default());
     // So its damage is none that the newer one repairs behind the owner's back.
@@ -797,8 +786,7 @@ fn an_older_image_from_a_probe_makes_the_record_of_an_installed_one_void() {
 /// While an image is confirmed and not installed, nothing else touches its flash.
 #[test]
 fn a_confirmed_image_is_kept_until_it_is_installed() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::on_trial(&old, &new);
+    let mut board = Board::on_trial(&OLD, &NEW);
     let mut node = board.start();
     // The installation fails: home cannot be erased.
     node.0.flash().protected = vec![4];
@@ -812,7 +800,7 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
     assert_eq!(node.progress().state, State::Confirmed);
     assert_eq!(node.try_command(1, CLEAR), Err(AbortCode::DEVICE_STATE));
     assert_eq!(node.status(1), BUSY);
-    let first = &block_file_at(&new, HOME.base, 200)[0];
+    let first = &block_file_at(&NEW, HOME.base, 200)[0];
     for program in [1, N] {
         assert_eq!(node.send(program, first), Err(AbortCode::DEVICE_STATE), "{program}");
         assert_eq!(node.status(program), BUSY);
