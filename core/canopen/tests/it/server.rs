@@ -37,7 +37,6 @@ impl Dialogue for Bench {
 
 /// These two frames are the ends of a service that works: a test shows with them that the server
 /// still works.
-/// well.
 #[track_caller]
 fn still_serves(bench: &mut Bench) {
     bench.expect(&[([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10])]);
