@@ -104,15 +104,15 @@ impl<'o> Buses<'o> {
         }
         let jobs: Vec<Job> = orders.iter().map(|order| order.job.clone()).collect();
         let options = ManyOptions::default().cancelled(self.cancelled.clone());
-        let tell = |number: usize, event: Event| {
+        let report = |number: usize, event: Event| {
             let order = &orders[number];
             for news in shown.news(order.job.node, &event) {
                 let _ = order.news.send(news);
             }
         };
         let results = match &mut link {
-            Link::Bus(adapter) => flash_many(&mut **adapter, &jobs, &options, &tell),
-            Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &tell),
+            Link::Bus(adapter) => flash_many(&mut **adapter, &jobs, &options, &report),
+            Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &report),
         };
         for (order, result) in orders.iter().zip(results) {
             let _ = order.done.send(flashed(&order.job, result));
@@ -135,7 +135,7 @@ impl Buses<'_> {
 impl Devices for Buses<'_> {
     fn attributes(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
         let TargetKind::Device(device) = &target.what else {
-            // A scan would end the transfers of other tools, only to tell this.
+            // A scan would end the transfers of other tools, only to report this.
             return Ok(of_agent(target));
         };
         let bus = self.bus(&target.bus);

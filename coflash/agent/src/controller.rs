@@ -165,7 +165,7 @@ pub(super) struct Rules {
     /// The first and longest pause after a failure.
     pub(super) backoff: (Duration, Duration),
     /// The pause between two messages of progress.
-    pub(super) tell: Duration,
+    pub(super) progress: Duration,
 }
 
 /// The pause between polls if the server names none: hawkBit's default.
@@ -225,7 +225,7 @@ enum Work {
         /// Whether the deployment was read since the file is there.
         fresh: bool,
         /// Whether the server has the report why the deployment is held.
-        told: bool,
+        reported: bool,
         /// How many times the bus or the device was in use or absent.
         tries: u32,
     },
@@ -249,7 +249,7 @@ struct Progress {
     /// The phases since the last message.
     phases: Vec<String>,
     percent: u8,
-    told: u8,
+    reported: u8,
     /// Whether there is something worth a message.
     news: bool,
     /// Not before this time.
@@ -408,8 +408,8 @@ impl Controller {
                 if now >= progress.at {
                     let rest = progress.phases.split_off(progress.phases.len().min(LINES_MOST));
                     progress.news = !rest.is_empty();
-                    progress.told = progress.percent;
-                    progress.at = now + self.rules.tell;
+                    progress.reported = progress.percent;
+                    progress.at = now + self.rules.progress;
                     progress.count += 1;
                     let percent = (progress.percent > 0).then_some(progress.percent);
                     let (action, phases) =
@@ -641,10 +641,10 @@ impl Controller {
         match &mut self.work {
             Work::Flashing { .. } => {}
             Work::Fetching { task: known, .. } if same(known, &task) => *known = task,
-            Work::Ready { task: known, fresh, told, .. } if same(known, &task) => {
+            Work::Ready { task: known, fresh, reported, .. } if same(known, &task) => {
                 *known = task.clone();
                 *fresh = true;
-                if may_begin || std::mem::replace(told, true) {
+                if may_begin || std::mem::replace(reported, true) {
                     return;
                 }
                 let why = if task.closed {
@@ -656,14 +656,14 @@ impl Controller {
                 };
                 self.say(Kind::Deployment, format!("action {}: held, because {why}", task.action));
                 let details = [format!("{} is here and checked; {why}", task.wanted.name)];
-                self.tell(&task.action, Execution::Downloaded, &details);
+                self.feedback(&task.action, Execution::Downloaded, &details);
             }
             _ => {
                 let Wanted { name, size, .. } = &task.wanted;
                 self.say(Kind::Deployment, format!("action {}: {name}, {size} bytes", task.action));
                 let resumed = self.record.has_begun(&task.action);
                 let execution = if resumed { Execution::Resumed } else { Execution::Download };
-                self.tell(&task.action, execution, &[format!("{name}, {size} bytes")]);
+                self.feedback(&task.action, execution, &[format!("{name}, {size} bytes")]);
                 self.work = Work::Fetching { task, at: now, failures: 0, wrong: 0 };
             }
         }
@@ -730,7 +730,7 @@ impl Controller {
         match piece {
             Piece::Whole => {
                 let task = task.clone();
-                self.work = Work::Ready { task, at: now, fresh: false, told: false, tries: 0 };
+                self.work = Work::Ready { task, at: now, fresh: false, reported: false, tries: 0 };
                 // The deployment may have been cancelled or closed meanwhile.
                 self.poll_early(now);
             }
@@ -768,9 +768,9 @@ impl Controller {
     }
 
     /// The attributes of the device, or why there are none.
-    pub(super) fn device_answered(&mut self, told: Result<Vec<(String, String)>, String>) {
+    pub(super) fn device_answered(&mut self, answer: Result<Vec<(String, String)>, String>) {
         self.query = DeviceQuery::No;
-        match told {
+        match answer {
             Ok(attributes) => self.todo.push_back(Ask::Config(attributes)),
             Err(why) => self.say(Kind::Trouble, format!("the device does not tell about itself: {why}")),
         }
@@ -802,7 +802,7 @@ impl Controller {
             News::Percent(percent) => {
                 let percent = percent.min(100);
                 progress.percent = percent;
-                let worth = percent >= progress.told.saturating_add(WORTH);
+                let worth = percent >= progress.reported.saturating_add(WORTH);
                 progress.news |= worth && progress.count < TOLD_MOST;
             }
         }
@@ -816,7 +816,7 @@ impl Controller {
         // An update without much to do ends before its plan was sent.
         if progress.news {
             for lines in phases.chunks(LINES_MOST) {
-                self.tell(&task.action, Execution::Proceeding, lines);
+                self.feedback(&task.action, Execution::Proceeding, lines);
             }
         }
         match flashed {
@@ -829,10 +829,10 @@ impl Controller {
                     self.unsaved = true;
                 }
                 let what = format!("the update waits: {why}");
-                self.tell(&task.action, Execution::Proceeding, std::slice::from_ref(&what));
+                self.feedback(&task.action, Execution::Proceeding, std::slice::from_ref(&what));
                 self.say(Kind::Trouble, format!("action {}: {what}", task.action));
                 let at = now + self.jitter.after(tries, self.rules.backoff);
-                self.work = Work::Ready { task, at, fresh: true, told: false, tries };
+                self.work = Work::Ready { task, at, fresh: true, reported: false, tries };
             }
         }
     }
@@ -876,7 +876,7 @@ impl Controller {
     }
 
     /// Puts a message on an action before the next requests.
-    fn tell(&mut self, action: &str, execution: Execution, details: &[String]) {
+    fn feedback(&mut self, action: &str, execution: Execution, details: &[String]) {
         let body = ddi::feedback(action, execution, Finished::None, None, details);
         self.todo.push_back(Ask::Tell { action: action.to_string(), body });
     }

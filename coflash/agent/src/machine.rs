@@ -47,12 +47,12 @@ pub(super) fn update(
     }
     let all = plan.updates().max(1);
     let percents = Mutex::new(BTreeMap::new());
-    let tell = |node: NodeId, entry: usize, event: Event| {
-        for its in shown.news(node, &event) {
-            let of_all = match its {
+    let report = |node: NodeId, entry: usize, event: Event| {
+        for item in shown.news(node, &event) {
+            let of_all = match item {
                 // A part of the machine keeps its program, and not the machine: the next plan finds out.
                 News::Kept => continue,
-                News::Failed(_) => its,
+                News::Failed(_) => item,
                 News::Phase(words) => News::Phase(format!("node {node}: {words}")),
                 News::Percent(percent) => {
                     let mut percents = percents.lock().unwrap_or_else(PoisonError::into_inner);
@@ -65,7 +65,7 @@ pub(super) fn update(
         }
     };
     let options = RunOptions::default().many(ManyOptions::default().cancelled(cancelled.clone()));
-    Ok(flashed(package, &run(&mut *adapter, package, &plan, &options, &tell)))
+    Ok(flashed(package, &run(&mut *adapter, package, &plan, &options, &report)))
 }
 
 /// Locks these nodes too among the programs of this computer.
@@ -128,9 +128,9 @@ fn flashed(package: &Package, outcomes: &[Outcome]) -> Flashed {
     }
     for (at, name) in names.iter().enumerate() {
         let which = |of: fn(&Good) -> bool| {
-            let its = outcomes.iter().filter(|outcome| outcome.entry == at);
-            let its = its.filter(|outcome| outcome.result.as_ref().is_ok_and(of));
-            let nodes: Vec<String> = its.filter_map(|outcome| Some(outcome.node?.to_string())).collect();
+            let all = outcomes.iter().filter(|outcome| outcome.entry == at);
+            let all = all.filter(|outcome| outcome.result.as_ref().is_ok_and(of));
+            let nodes: Vec<String> = all.filter_map(|outcome| Some(outcome.node?.to_string())).collect();
             nodes.join(", ")
         };
         let updated = which(|good| matches!(good, Good::Updated(_)));

@@ -68,7 +68,7 @@ coflash_core::options! {
         /// The longest pause after a failure.
         pub backoff_most: Duration = Duration::from_secs(300),
         /// The shortest pause between two messages of progress.
-        pub tell: Duration = Duration::from_secs(5),
+        pub progress: Duration = Duration::from_secs(5),
         /// How long a server may send nothing.
         pub silent: Duration = Duration::from_secs(20),
         /// How long a request may take, apart from files.
@@ -114,7 +114,7 @@ struct Shared<'r> {
     config: &'r Config,
     options: &'r Options,
     devices: &'r dyn Devices,
-    tell: &'r (dyn Fn(&Message) + Sync),
+    report: &'r (dyn Fn(&Message) + Sync),
     client: Client,
     limits: Limits,
     store: Store,
@@ -129,7 +129,7 @@ pub fn run(
     config: &Config,
     options: &Options,
     devices: &dyn Devices,
-    tell: &(dyn Fn(&Message) + Sync),
+    report: &(dyn Fn(&Message) + Sync),
 ) -> Result<Ended, CannotStart> {
     let folder = &config.state;
     let unusable = |error: &dyn std::fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
@@ -139,7 +139,7 @@ pub fn run(
     let limits = Limits { silent, request };
     let client =
         Client::new(config.server.clone(), config.ca_file.as_deref(), limits).map_err(CannotStart)?;
-    let shared = Shared { config, options, devices, tell, client, limits, store, began: Instant::now() };
+    let shared = Shared { config, options, devices, report, client, limits, store, began: Instant::now() };
     let shared = &shared;
     let results: Vec<Ended> = thread::scope(|scope| {
         let threads: Vec<_> =
@@ -177,7 +177,7 @@ fn record(shared: &Shared<'_>, target: &Target, root: &str, seed: u64) -> Option
             Ok(record) => return Some(record),
             Err(why) => why,
         };
-        (shared.tell)(&Message {
+        (shared.report)(&Message {
             controller: target.controller.clone(),
             kind: Kind::Trouble,
             text: why,
@@ -203,7 +203,7 @@ fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
     let Some(record) = record(shared, target, &root, seed) else {
         return Ended { unserved: 1, ..Ended::default() };
     };
-    let Times { backoff_first, backoff_most, tell, .. } = options.times;
+    let Times { backoff_first, backoff_most, progress, .. } = options.times;
     let rules = Rules {
         part: target.part.clone(),
         artifact: target.artifact.clone(),
@@ -212,7 +212,7 @@ fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
         size_most: MAX_FILE_SIZE,
         poll: config.poll,
         backoff: (backoff_first, backoff_most),
-        tell,
+        progress,
     };
     let mut controller = Controller::new(&target.controller, rules, record, seed);
     let path = shared.store.path(&target.controller, "part");
@@ -226,7 +226,7 @@ fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
                     Kind::Failed => ended.failed += 1,
                     _ => {}
                 }
-                (shared.tell)(&said);
+                (shared.report)(&said);
             }
             let now = shared.began.elapsed();
             let over = options.cancelled.load(Ordering::Relaxed);
@@ -284,7 +284,7 @@ fn wait(shared: &Shared<'_>, controller: &mut Controller, heard: &Receiver<Heard
     loop {
         let now = shared.began.elapsed();
         match next {
-            Ok(Heard::Attributes(told)) => controller.device_answered(told),
+            Ok(Heard::Attributes(answer)) => controller.device_answered(answer),
             Ok(Heard::News(news)) => controller.news(news),
             Ok(Heard::Flashed(flashed)) => controller.flashed(now, flashed),
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => return,

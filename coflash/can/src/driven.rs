@@ -126,17 +126,17 @@ impl Driven {
         let (frames, incoming) = mpsc::sync_channel(INCOMING);
         let status = Arc::<Mutex<DriverStatus>>::default();
         let shared = status.clone();
-        let (told, opened) = mpsc::sync_channel(1);
+        let (ready, opened) = mpsc::sync_channel(1);
         thread::spawn(move || {
             let mut driver = match open() {
                 Ok(driver) => driver,
                 Err(error) => {
-                    let _ = told.send(Err(error));
+                    let _ = ready.send(Err(error));
                     return;
                 }
             };
             // If this fails, the tool has given up waiting for the driver.
-            if told.send(Ok(())).is_ok() {
+            if ready.send(Ok(())).is_ok() {
                 if let Err(fault) = work(&mut driver, &commands, &frames, &shared) {
                     lock(&shared).fault = Some(fault);
                 }
@@ -185,7 +185,7 @@ fn work(
 ) -> Result<(), Fault> {
     // A frame that found no room, and the time of the first attempt.
     let mut waiting: Option<(Frame, Instant)> = None;
-    let mut looked = Instant::now();
+    let mut reported = Instant::now();
     loop {
         loop {
             let (frame, since) = match waiting.take() {
@@ -209,8 +209,8 @@ fn work(
                 return Ok(());
             }
         }
-        if looked.elapsed() >= STATUS_PERIOD {
-            looked = Instant::now();
+        if reported.elapsed() >= STATUS_PERIOD {
+            reported = Instant::now();
             lock(status).health = driver.health();
         }
     }

@@ -54,7 +54,7 @@ enum Channel {
         is_beginning: bool,
     },
     /// A transfer has begun, or ended with an abort.
-    Seen,
+    Known,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -105,7 +105,7 @@ impl Redactor {
         };
         // The segments of a block follow each other without an answer; all other frames are answered.
         let (is_next, was_beginning) = match self.channels.get(&request) {
-            Some(Channel::Seen) => return false,
+            Some(Channel::Known) => return false,
             Some(Channel::Open { id: latest, first: number, is_beginning }) => {
                 ((*latest, number.wrapping_add(1) & 0x7F) == (id, first & 0x7F), *is_beginning)
             }
@@ -113,7 +113,7 @@ impl Redactor {
         };
         let is_abort = first == 0x80;
         if is_abort || (was_beginning && !is_next) {
-            self.channels.insert(request, Channel::Seen);
+            self.channels.insert(request, Channel::Known);
             return false;
         }
         // What is neither a segment nor an acknowledgement names an object, or has no data.

@@ -211,8 +211,8 @@ mod tests {
         bytes[4..8].copy_from_slice(&crc.to_le_bytes());
         let loaded = load(Arc::new(bytes), "new.bin", &Settings::default()).unwrap();
         assert!(loaded.program.is_bootloader());
-        let Firmware { crc: told, vendor_id, product_code, version, .. } = loaded.shown;
-        assert_eq!((told, vendor_id, product_code), (crc, Some(1), Some(2)));
+        let Firmware { crc: shown, vendor_id, product_code, version, .. } = loaded.shown;
+        assert_eq!((shown, vendor_id, product_code), (crc, Some(1), Some(2)));
         assert_eq!(version.as_deref(), Some("1.3"));
     }
 

@@ -99,8 +99,8 @@ impl Server {
         })?;
         let port = listener.local_addr()?.port();
         let guard = Guard { token: Guard::token().map_err(io::Error::other)?, port };
-        let (tell, orders) = sync_channel(4);
-        let shared = Arc::new(Shared::new(tell, options.failed.clone()));
+        let (sender, orders) = sync_channel(4);
+        let shared = Arc::new(Shared::new(sender, options.failed.clone()));
         Ok(Self {
             runtime,
             listener,

@@ -354,7 +354,7 @@ impl Device {
             supply: info.state.and_then(|state| supply(state.supply)),
             option_bytes: option_bytes.map(|bytes| bytes.to_string()),
             warnings: option_bytes.map_or(Vec::new(), |bytes| bytes.warnings()),
-            renewable: info.bootloader.map(|its| advice::with_advice(its, its.advice())),
+            renewable: info.bootloader.map(|bootloader| advice::with_advice(bootloader, bootloader.advice())),
             programs: info.programs.iter().map(Program::of).collect(),
             verdict: None,
         }
@@ -408,11 +408,11 @@ impl Firmware {
     /// Compares the file with a device.
     fn against(&self, device: &Device, number: u8) -> Verdict {
         let verdict = |fits, words: String| Verdict { fits, words };
-        let told = match (self.vendor_id, self.product_code) {
+        let target = match (self.vendor_id, self.product_code) {
             (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
             _ => None,
         };
-        match (told, device.product()) {
+        match (target, device.product()) {
             (Some((file, _)), Some((own, _))) if file != own => {
                 verdict(Fits::No, format!("made for vendor-ID {file:08X}h, this device has {own:08X}h"))
             }

@@ -73,8 +73,8 @@ fn session<'l>(link: &'l mut Link, shared: &Shared, node: NodeId) -> Session<'l>
 /// the previous task.
 fn read_again(link: &mut Link, shared: &Shared, node: NodeId) {
     let mut session = Session::on(link, node, Timing::default().boot(Duration::from_secs(1)));
-    let told = info(&mut session);
-    shared.change(|state| match told {
+    let answer = info(&mut session);
+    shared.change(|state| match answer {
         Ok(info) => state.update_device(&info),
         Err(_) => state.silent(node),
     });
@@ -90,27 +90,27 @@ fn step_of(link: &mut Link, shared: &Shared, node: NodeId, number: u8, step: Ste
 
 fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) -> Result<Notice, Error> {
     let node = session.node();
-    let mut tell = |event: Event| {
+    let mut note = |event: Event| {
         let words = advice::with_advice(&event, event.advice());
         shared.change(|state| state.task.as_mut().map(|task| task.words = format!("node {node}: {words}")));
     };
     let words = match step {
         Step::CallBack => {
-            steps::enter_bootloader(session, &mut tell)?;
+            steps::enter_bootloader(session, &mut note)?;
             "the bootloader is running".to_string()
         }
         Step::Erase => {
-            steps::enter_bootloader(session, &mut tell)?;
+            steps::enter_bootloader(session, &mut note)?;
             steps::erase_at_once(session, number)?;
             format!("program {number} is erased")
         }
         Step::Release => {
-            tell(Event::Found(session.find()?));
-            steps::release(session, number, &mut tell)?;
+            note(Event::Found(session.find()?));
+            steps::release(session, number, &mut note)?;
             format!("program {number} is released for autostart")
         }
         Step::Withhold => {
-            tell(Event::Found(session.find()?));
+            note(Event::Found(session.find()?));
             steps::withdraw(session, number)?;
             format!("program {number} is no longer released: it does not start by itself")
         }
@@ -149,7 +149,7 @@ fn update_all(
         .map(|node| One::new(*node, file.program.clone(), for_node(shared, file, *node, options)))
         .collect();
     let many = ManyOptions::default().at_once(AT_ONCE).cancelled(shared.cancelled.clone());
-    let tell = |number: usize, event: Event| {
+    let note = |number: usize, event: Event| {
         if let Some(job) = jobs.get(number) {
             shared.record(job.node, &event);
         }
@@ -161,8 +161,8 @@ fn update_all(
     };
     let began = wall();
     let results = match link {
-        Link::Bus(adapter) => update::flash_many(&mut **adapter, &jobs, &many, &tell),
-        Link::Gateway(gateway) => update::flash_in_turn(&mut **gateway, &jobs, &many, &tell),
+        Link::Bus(adapter) => update::flash_many(&mut **adapter, &jobs, &many, &note),
+        Link::Gateway(gateway) => update::flash_in_turn(&mut **gateway, &jobs, &many, &note),
     };
     let failed = results.iter().filter(|result| result.is_err()).count();
     shared.change(|state| {
@@ -198,7 +198,7 @@ fn update_all(
 
 /// Adds the check that the device is the target of the file, if both give their identity.
 fn for_node(shared: &Shared, file: &Loaded, node: NodeId, options: FlashOptions) -> FlashOptions {
-    let told = shared.read(|state| {
+    let product = shared.read(|state| {
         let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
         device.product()
     });
@@ -206,7 +206,7 @@ fn for_node(shared: &Shared, file: &Loaded, node: NodeId, options: FlashOptions)
         (Some(vendor_id), Some(product_code)) => Some(Target { vendor_id, product_code }),
         _ => None,
     };
-    options.check_target(target.filter(|_| told.is_some()))
+    options.check_target(target.filter(|_| product.is_some()))
 }
 
 fn report(

@@ -20,7 +20,7 @@ fn rules() -> Rules {
         size_most: 1 << 20,
         poll: (seconds(10), seconds(3600)),
         backoff: (seconds(4), seconds(64)),
-        tell: seconds(5),
+        progress: seconds(5),
     }
 }
 
@@ -118,7 +118,7 @@ impl Drive {
     #[track_caller]
     fn go_to_flash(&mut self) -> Flash {
         self.deploy(&deployment("8", "forced"));
-        assert_eq!(self.feedback(), told("deploymentBase/8", "download", "none"));
+        assert_eq!(self.feedback(), feedback("deploymentBase/8", "download", "none"));
         let Step::Fetch(wanted) = self.next() else { panic!("no download") };
         assert_eq!((wanted.size, wanted.link.as_str()), (1000, "/a.blk"));
         self.controller.fetched(self.now, Piece::Whole);
@@ -133,7 +133,7 @@ impl Drive {
     }
 }
 
-fn told(of: &str, execution: &str, finished: &str) -> (String, String, String) {
+fn feedback(of: &str, execution: &str, finished: &str) -> (String, String, String) {
     (format!("{of}/feedback"), execution.to_string(), finished.to_string())
 }
 
@@ -157,7 +157,7 @@ fn a_deployment_is_fetched_flashed_and_reported_once() {
     assert!(!flash.kept);
     assert!(drive.disk.has_begun("8"), "the record is written before the device is changed");
     drive.controller.flashed(drive.now, Flashed::Done(vec!["done".into()]));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "success"));
     assert!(drive.disk.finish_of("8").unwrap().ok && drive.disk.begun.is_none());
     // Then the next poll, at once: there may be more to do. After it the pause that the server
     // wants, and up to a tenth more.
@@ -176,12 +176,12 @@ fn the_same_action_again_is_reported_and_not_flashed_even_after_a_restart() {
     let mut drive = Drive::new();
     drive.go_to_flash();
     drive.controller.flashed(drive.now, Flashed::Failed(vec!["node 5 does not answer".into()]));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "failure"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "failure"));
     drive.deploy(&deployment("8", "forced"));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "failure"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "failure"));
     let mut drive = drive.restarted();
     drive.deploy(&deployment("8", "forced"));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "failure"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "failure"));
     // Without a pause the two would talk to each other for ever.
     let before = drive.now;
     drive.poll(&[]);
@@ -199,7 +199,7 @@ fn a_result_that_the_server_did_not_take_is_reported_until_it_does() {
     }
     // The agent ends in between.
     let mut drive = drive.restarted();
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "success"));
     // A server that has closed the action is content, too.
     let mut drive = Drive::new();
     drive.go_to_flash();
@@ -215,7 +215,7 @@ fn what_a_restart_interrupted_goes_on_whatever_the_window() {
     drive.go_to_flash();
     let mut drive = drive.restarted();
     drive.deploy(&deployment("8", "skip"));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "resumed", "none"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "resumed", "none"));
     assert!(matches!(drive.next(), Step::Fetch(_)));
     drive.controller.fetched(drive.now, Piece::Whole);
     drive.deploy(&deployment("8", "skip"));
@@ -249,7 +249,7 @@ fn a_cancellation_is_accepted_until_the_device_is_changed() {
         drive.feedback()
     };
     let (accepted, rejected) =
-        (told("cancelAction/11", "closed", "success"), told("cancelAction/11", "rejected", "none"));
+        (feedback("cancelAction/11", "closed", "success"), feedback("cancelAction/11", "rejected", "none"));
     // Before anything was known of it.
     assert_eq!(cancelled(&mut Drive::new()), accepted);
     // While the file is fetched, and when it is there.
@@ -265,7 +265,7 @@ fn a_cancellation_is_accepted_until_the_device_is_changed() {
     assert_eq!(cancelled(&mut drive.restarted()), rejected);
     // And the update goes on to its end.
     drive.controller.flashed(drive.now, Flashed::Done(vec![]));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "success"));
     assert_eq!(cancelled(&mut drive), rejected);
 }
 
@@ -293,7 +293,7 @@ fn a_held_deployment_is_fetched_and_waits() {
         let mut drive = Drive::with(rules, Record::new(BASE));
         drive.fetch(&held);
         drive.deploy(&held);
-        assert_eq!(drive.feedback(), told("deploymentBase/8", "downloaded", "none"), "{held}");
+        assert_eq!(drive.feedback(), feedback("deploymentBase/8", "downloaded", "none"), "{held}");
         assert!(drive.controller.is_settled(drive.now));
         // The server gets one report.
         drive.deploy(&held);
@@ -342,7 +342,7 @@ fn only_a_file_that_is_meant_and_can_be_checked_is_fetched() {
     ] {
         let mut drive = Drive::new();
         drive.deploy(&deployment);
-        assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "failure"));
+        assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "failure"));
         assert!(drive.says(words), "{words}");
     }
     let mut other = deployment("8", "forced");
@@ -541,8 +541,8 @@ fn progress_is_told_sparingly_and_the_device_waits_for_no_message() {
         }
         drive.now = until;
     }
-    let told: Vec<u64> = messages.iter().map(|(_, percent)| *percent).collect();
-    assert_eq!(told, [10, 30, 50, 70, 90], "each ten percent, and each five seconds");
+    let sent: Vec<u64> = messages.iter().map(|(_, percent)| *percent).collect();
+    assert_eq!(sent, [10, 30, 50, 70, 90], "each ten percent, and each five seconds");
     assert!(drive.now - began >= seconds(25));
     // Not even ten thousand phases make more than a hundred messages.
     for number in 0..10_000 {
@@ -568,7 +568,7 @@ fn what_was_not_told_before_the_end_is_told_with_it() {
     let Request::Post(_, body) = drive.asks() else { panic!("no feedback") };
     assert_eq!(body["status"]["details"], json!(["node 5: door: it has 1.0.0", "node 77: left alone"]));
     drive.answer(200, &json!({}));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "closed", "success"));
 }
 
 /// A plan has more lines than a message.
@@ -578,20 +578,20 @@ fn a_long_plan_is_told_in_several_messages() {
     drive.go_to_flash();
     let plan: Vec<String> = (1..=120).map(|node| format!("node {node}: drive: it has 1.0.0")).collect();
     plan.iter().for_each(|line| drive.controller.news(News::Phase(line.clone())));
-    let mut told = Vec::new();
+    let mut sent = Vec::new();
     let mut message = |drive: &mut Drive| {
         let Request::Post(_, body) = drive.asks() else { panic!("no feedback") };
         let lines = body["status"]["details"].as_array().unwrap();
         assert!(lines.len() <= 50, "hawkBit keeps 50");
-        told.extend(lines.iter().map(|line| line.as_str().unwrap().to_string()));
+        sent.extend(lines.iter().map(|line| line.as_str().unwrap().to_string()));
         drive.answer(200, &json!({}));
     };
     message(&mut drive);
     drive.controller.flashed(drive.now, Flashed::Done(vec!["drive: had it before".into(); 60]));
     message(&mut drive);
     message(&mut drive);
-    assert_eq!(told, plan);
-    assert_eq!(drive.feedback(), self::told("deploymentBase/8", "closed", "success"));
+    assert_eq!(sent, plan);
+    assert_eq!(drive.feedback(), self::feedback("deploymentBase/8", "closed", "success"));
     // The state file has the lines that the server gets.
     assert_eq!(drive.disk.ended.last().unwrap().details.len(), 50);
 }
@@ -602,7 +602,7 @@ fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
     drive.go_to_flash();
     let before = drive.now;
     drive.controller.flashed(drive.now, Flashed::NotNow("node 5: another coflash works on it".into()));
-    assert_eq!(drive.feedback(), told("deploymentBase/8", "proceeding", "none"));
+    assert_eq!(drive.feedback(), feedback("deploymentBase/8", "proceeding", "none"));
     assert!(drive.disk.begun.is_none(), "nothing was changed");
     assert!(matches!(drive.next(), Step::Flash(_)));
     assert!(drive.now - before >= seconds(2));
@@ -612,7 +612,7 @@ fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
     drive.poll(&[("cancelAction", "/c")]);
     drive.asks();
     drive.answer(200, &json!({ "id": "11", "cancelAction": { "stopId": "8" } }));
-    assert_eq!(drive.feedback(), told("cancelAction/11", "closed", "success"));
+    assert_eq!(drive.feedback(), feedback("cancelAction/11", "closed", "success"));
     drive.poll(&[]);
 }
 

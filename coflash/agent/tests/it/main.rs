@@ -107,7 +107,7 @@ fn options() -> Options {
     let times = Times::default()
         .backoff_first(ms(10))
         .backoff_most(ms(40))
-        .tell(ms(1))
+        .progress(ms(1))
         .silent(ms(1000))
         .request(ms(2000))
         .piece(ms(2000));

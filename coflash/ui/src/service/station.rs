@@ -130,9 +130,9 @@ impl Station {
         let (mut rows, mut number, mut others) = (Vec::new(), None, Vec::new());
         match &own.stage {
             Stage::Waiting | Stage::Searching => {}
-            Stage::Planned { number: its, plan } => {
+            Stage::Planned { number: planned, plan } => {
                 rows = row::rows(plan);
-                (number, others) = (Some(*its), row::others(plan));
+                (number, others) = (Some(*planned), row::others(plan));
             }
             Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
         }

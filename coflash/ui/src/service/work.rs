@@ -149,7 +149,7 @@ impl Work for Update {
             Err(message) => return refused(station, shared, back(), message),
         };
         let date = wall().as_secs();
-        let tell = |node: NodeId, _: usize, event: Event| {
+        let on_event = |node: NodeId, _: usize, event: Event| {
             shared.record(node, &event);
             shared.change(|state| {
                 if let Some(update) = state.updates.iter_mut().find(|update| update.node == node.get()) {
@@ -159,7 +159,7 @@ impl Work for Update {
         };
         let many = ManyOptions::default().cancelled(shared.cancelled.clone());
         let options = RunOptions::default().flash(FlashOptions::default().unlock(self.unlock)).many(many);
-        let outcomes = machine::run(&mut **adapter, &service.package, &self.chosen(), &options, &tell);
+        let outcomes = machine::run(&mut **adapter, &service.package, &self.chosen(), &options, &on_event);
         note(&mut rows, &outcomes);
         if outcomes.iter().any(trouble::is_locked) {
             station.change(|own| own.asks_password = true);

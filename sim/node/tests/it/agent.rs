@@ -40,7 +40,7 @@ fn options() -> Options {
     let ms = Duration::from_millis;
     Options::default()
         .once(true)
-        .times(Times::default().backoff_first(ms(50)).backoff_most(ms(200)).tell(ms(1)))
+        .times(Times::default().backoff_first(ms(50)).backoff_most(ms(200)).progress(ms(1)))
 }
 
 fn serve(config: &Config, options: &Options) -> (Ended, String) {
