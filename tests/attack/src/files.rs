@@ -16,7 +16,7 @@ use crate::sealed::{certificate, keys, sealer, Parts};
 /// What a download contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Content {
-    /// The RAM image of a bootloader: 0 to 3 may run here, 4 is damaged, and 5 is for another board.
+    /// The RAM image of a bootloader: 0 to 3 and 6 may run here, 4 is damaged, and 5 is for another board.
     Image(u8),
     /// A program with this number, for its place.
     Program(u8, Extent),
@@ -314,13 +314,28 @@ impl Sent {
 
 /// Whether an image with this CRC may run on a device.
 pub fn may_run(setup: &'static Setup, crc: u32) -> bool {
-    (0..4).any(|number| file(setup, Content::Image(number)).crc == crc)
+    counter_of_image(setup, crc).is_some()
+}
+
+/// The security counter of the image with this CRC, if it may run on a device.
+pub fn counter_of_image(setup: &'static Setup, crc: u32) -> Option<u32> {
+    let is_it = |which: &u8| file(setup, Content::Image(*which)).crc == crc;
+    [0, 1, 2, 3, 6].into_iter().find(is_it).map(image_counter)
+}
+
+/// The security counter of an image: 6 has that of 1.
+fn image_counter(which: u8) -> u32 {
+    if which == 6 {
+        image_counter(1)
+    } else {
+        1 + u32::from(which)
+    }
 }
 
 fn make(setup: &Setup, content: Content) -> File {
     let (number, base, chunk, plain) = match content {
         Content::Image(which) => {
-            let counter = 1 + u32::from(which);
+            let counter = image_counter(which);
             let board = if which == 5 { !BOARD } else { BOARD };
             let features = setup.host().features;
             let of = Header { counter, board, features, vendor: 0, product: 0, version: counter, ..SOUND };
@@ -397,7 +412,7 @@ fn sealed(setup: &Setup, program: u8, content: Content, plain: &[u8]) -> Vec<u8>
             sealer.seal(plain, &keys().release)
         }
         _ => {
-            let counter = if let Content::Image(which) = content { 1 + u32::from(which) } else { COUNTER };
+            let counter = if let Content::Image(which) = content { image_counter(which) } else { COUNTER };
             Sealer { program, counter, data, certificate: None, ..sealer((false, false)) }
                 .seal(plain, &keys().root)
         }

@@ -12,7 +12,7 @@ use shared_abi::renewal::{Origin, State};
 use shared_abi::warm_start::BootRequest;
 
 use crate::device::{Action, Holder, Partial, Program, Seen, Stored, Trouble};
-use crate::files::{file, may_run, Content, Flaw, Part, Sent};
+use crate::files::{counter_of_image, file, may_run, Content, Flaw, Part, Sent};
 
 /// What was before an action, and the action with its answer.
 #[derive(Clone)]
@@ -243,6 +243,7 @@ pub const RULES: &[Rule] = &[
     Rule { name: "no security counter decreases", is_kept: counts },
     Rule { name: "no program is there before its security counter", is_kept: is_counted },
     Rule { name: "no program follows a proved one with a higher counter", is_kept: follows },
+    Rule { name: "a sealed bootloader follows one with a lower counter", is_kept: follows_home },
 ];
 
 /// The first rule that is broken.
@@ -426,4 +427,15 @@ fn follows(before: &History, now: &Seen) -> bool {
         || programs.zip(&before.proved).all(|((number, (was, now)), proved)| {
             was.stored == now.stored || now.record.is_none() || counter_of(before, number, now) >= *proved
         })
+}
+
+/// Two genuine bootloaders cannot be exchanged for ever.
+fn follows_home(before: &History, now: &Seen) -> bool {
+    let (setup, was) = (before.setup, &before.seen);
+    let is_certain = was.is_certain && now.is_certain && !before.is_spoilt;
+    let is_new = |crc: &u32| was.record.map(|record| record.crc) != Some(*crc);
+    let staged = now.record.filter(|_| now.is_staged).map(|record| record.crc).filter(is_new);
+    let counter = |crc| counter_of_image(setup, crc);
+    let follows = |(staged, home)| counter(staged) > counter(home);
+    !setup.takes_sealed || !is_certain || staged.zip(was.home).is_none_or(follows)
 }

@@ -13,7 +13,7 @@ use crate::files::{file, free, Changes, Content, Extent, Flaw, Part, Sent, RELEA
 
 /// Commands of 1F51h.
 const COMMANDS: [u8; 9] = [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, 0x84];
-const IMAGES: [u8; 6] = [1, 1, 2, 2, 4, 5];
+const IMAGES: [u8; 6] = [1, 6, 2, 2, 4, 5];
 const EXTENTS: [Extent; 4] = [Extent::Small, Extent::Small, Extent::Large, Extent::Untold];
 
 const INDICES: [u16; 9] = [0x1000, 0x1001, 0x1008, 0x100A, 0x1018, 0x1F51, 0x1F56, 0x1F57, 0x1F50];
