@@ -33,17 +33,6 @@ fn forged(seed: u8, counter: u32, version: u32) -> Vec<u8> {
     Parts::of(&file).signed_by(&keys().stranger).bytes()
 }
 
-/// An event of 2003h; 1 is the latest.
-fn logged(host: &mut Host<'_>, sub: u8) -> [u32; 4] {
-    let mut bytes = [0; 16];
-    assert_eq!(host.node.read(Address::new(0x2003, sub), &mut bytes), Ok(16));
-    [0, 4, 8, 12].map(|at| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()))
-}
-
-fn log(host: &mut Host<'_>) -> Vec<[u32; 4]> {
-    (1..=EVENTS as u8).map(|sub| logged(host, sub)).collect()
-}
-
 #[test]
 fn rights_add_up_and_end_with_the_power() {
     let device = Device::sealed(&STANDARD_1);
@@ -290,40 +279,40 @@ fn the_log_tells_the_last_events_the_latest_first() {
     let device = Device::sealed(&STANDARD_1);
     let code = |status: u32| event::REFUSED | status;
     device.run(|host| {
-        assert_eq!(log(host), [[0; 4]; EVENTS]);
+        assert_eq!(host.log(), [[0; 4]; EVENTS]);
         host.install(1, &sealed(1, 5, 11));
-        assert_eq!(logged(host, 1), [1, event::INSTALLED | 1, 5, 11]);
+        assert_eq!(host.event(1), [1, event::INSTALLED | 1, 5, 11]);
         // The same refusal once, another one between two of them.
         for _ in 0..3 {
             assert_eq!(host.update(1, &forged(2, 6, 12), 7).1, status::SIGNATURE);
         }
-        assert_eq!(logged(host, 1), [2, code(status::SIGNATURE), 6, 12]);
+        assert_eq!(host.event(1), [2, code(status::SIGNATURE), 6, 12]);
         assert_eq!(host.update(1, &sealed(3, 4, 13), 7).1, status::ROLLBACK);
-        assert_eq!(logged(host, 1), [3, code(status::ROLLBACK), 4, 13]);
+        assert_eq!(host.event(1), [3, code(status::ROLLBACK), 4, 13]);
         // A refusal that the log has, also after another one.
         assert_eq!(host.update(1, &forged(2, 6, 12), 7).1, status::SIGNATURE);
-        assert_eq!(logged(host, 1), [3, code(status::ROLLBACK), 4, 13]);
+        assert_eq!(host.event(1), [3, code(status::ROLLBACK), 4, 13]);
         host.wait();
         let rights = right::ERASE | right::STORE;
         assert!(host.grant(&keys().root, rights, 0));
-        assert_eq!(logged(host, 1)[..2], [4, event::UNLOCKED | rights]);
-        assert_eq!(logged(host, 4), [1, event::INSTALLED | 1, 5, 11]);
-        assert_eq!(logged(host, 5), [0; 4]);
+        assert_eq!(host.event(1)[..2], [4, event::UNLOCKED | rights]);
+        assert_eq!(host.event(4), [1, event::INSTALLED | 1, 5, 11]);
+        assert_eq!(host.event(5), [0; 4]);
     });
     // Each installation is told, but not the same image again; and the log is there after a reset.
     let before = device.run(|host| {
-        let before = log(host);
+        let before = host.log();
         assert_eq!(before[0][..2], [4, event::UNLOCKED | right::ERASE | right::STORE]);
         for version in 20..30 {
             host.install(1, &sealed(version as u8, 5, version));
             host.install(1, &sealed(version as u8, 5, version));
         }
-        log(host)
+        host.log()
     });
     assert_eq!(before[0], [14, event::INSTALLED | 1, 5, 29]);
     let numbers: Vec<u32> = before.iter().map(|event| event[0]).collect();
     assert_eq!(numbers, (7..=14).rev().collect::<Vec<_>>());
-    device.run(|host| assert_eq!(log(host), before));
+    device.run(|host| assert_eq!(host.log(), before));
 }
 
 /// The boot stage locks the flash for a program, unless its owner has signed that it writes flash.

@@ -8,8 +8,8 @@ use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::Fleet;
-use coboot_tests::sealed_board::{board, keys, release, sealer, status, write, COUNTER, KEKS};
-use coflash_core::device::{Doing, Transfers};
+use coboot_tests::sealed_board::{board_with_a_program, keys, seal, sealer, status, COUNTER, KEKS};
+use coflash_core::device::Doing;
 use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::convert::blocks_of_sealed;
 use coflash_core::file::sealed::{SealedFile, Sealer};
@@ -22,10 +22,6 @@ const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
 const VERSION: Address = Address::new(0x100A, 0);
-
-fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
-    sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
-}
 
 /// Its blocks, each as one download.
 fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {
@@ -71,15 +67,6 @@ fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
     bench.session().command(1, ProgramControl::Stop).unwrap();
     bench.run_ms(100);
     assert!(bench.is_bootloader(NODE), "{what}");
-}
-
-/// A sealed board in its bootloader, with version 1 from a download in one transfer.
-fn board_with_a_program() -> Bench {
-    let mut bench = board().switched_on();
-    let file = seal(&sealer(COUNTER), firmware::APP_V1);
-    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
-    assert_runs(&mut bench, "1.0.0", "version 1");
-    bench
 }
 
 #[test]

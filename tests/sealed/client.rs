@@ -9,7 +9,7 @@ use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, release, sealer, COUNTER, KEKS};
+use coboot_tests::sealed_board::{board, seal, sealer, COUNTER, KEKS};
 use coflash_core::file::sealed::Sealer;
 
 /// 100Ah, software version.
@@ -29,7 +29,7 @@ fn started() -> Bench {
 fn an_unmodified_python_canopen_writes_a_sealed_image() {
     let mut endpoint = Endpoint::new(started());
     let genuine = Sealer { compress: true, ..sealer(COUNTER) };
-    let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
+    let genuine = seal(&genuine, firmware::APP_V1);
     let mut flipped = genuine.clone();
     flipped[50] ^= 1;
     for (way, file, said) in [
@@ -58,7 +58,7 @@ fn an_unmodified_python_canopen_writes_a_sealed_image() {
 fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
     let mut endpoint = Endpoint::slower(started(), SLOWER);
     let genuine = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
-    let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
+    let genuine = seal(&genuine, firmware::APP_V1);
     let factor = SLOWER.to_string();
     let ways = ["--block", "--as-it-comes", &factor];
     let output = python_canopen(&mut endpoint, "as-it-comes.cbs", &genuine, &ways);

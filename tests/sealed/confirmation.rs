@@ -5,7 +5,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{control, Bench, ACKNOWLEDGED, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE};
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER};
+use coboot_tests::sealed_board::{board, seal, sealer, write, COUNTER};
 use coflash_core::device::Transfers;
 use shared_abi::warm_start::{BootRequest, StoredNode, WarmStart};
 
@@ -18,7 +18,7 @@ const REFUSED: [u8; 8] = [0x80, 0x51, 0x1F, 1, 0x22, 0, 0, 0x08];
 /// A sealed board with a sealed program that was downloaded in one transfer and started.
 fn fresh_board(image: &str) -> Bench {
     let mut bench = board().switched_on();
-    let file = sealer(COUNTER).seal(&firmware::raw(image), &release()).unwrap();
+    let file = seal(&sealer(COUNTER), image);
     assert_eq!(write(&mut bench, &file, Transfers::Segments), (None, 0), "{image}");
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);

@@ -12,14 +12,14 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::listener::Listener;
 use coboot_tests::sealed_board::{
-    board, board_of, key, keys, open_board, release, root, sealer, status, write, COUNTER, KEKS,
+    board, board_of, board_with_a_program, call_back, key, keys, open_board, root, seal, sealer, start,
+    status, write, COUNTER, KEKS,
 };
 use coflash_core::device::access::{ask, challenge, events};
 use coflash_core::device::debugger::Debugger;
 use coflash_core::device::Transfers;
 use coflash_core::file::block_file::emit;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
-use kit::rig::crc32;
 use seal::access::{event, right};
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -35,39 +35,6 @@ fn kinds(counter: u32) -> [(&'static str, Sealer<'static>); 4] {
         ("compressed", Sealer { compress: true, ..plain }),
         ("encrypted and compressed", Sealer { compress: true, ..encrypted }),
     ]
-}
-
-fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
-    sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
-}
-
-/// Starts the downloaded program, and checks that it is the right one.
-fn start(bench: &mut Bench, image: &str, version: &str) {
-    let crc = bench.session().read_number(CRC_OF_PROGRAM).unwrap();
-    assert_eq!(crc, crc32(&firmware::raw(image)));
-    bench.session().command(1, ProgramControl::Start).unwrap();
-    bench.await_boot_up(1000);
-    assert!(!bench.is_bootloader(NODE), "{image} was not started");
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), version);
-    assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), crc);
-}
-
-/// Stops the program: the device returns to the bootloader, which confirms the program. (The first
-/// 80h after a download in one transfer would mean "confirm".)
-fn call_back(bench: &mut Bench) {
-    bench.session().command(1, ProgramControl::Stop).unwrap();
-    bench.run_ms(100);
-    assert!(bench.is_bootloader(NODE));
-}
-
-/// A sealed device in its bootloader, with version 1 installed, started once and confirmed.
-fn board_with_a_program() -> Bench {
-    let mut bench = board().switched_on();
-    let file = seal(&sealer(COUNTER), firmware::APP_V1);
-    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
-    start(&mut bench, firmware::APP_V1, "1.0.0");
-    call_back(&mut bench);
-    bench
 }
 
 /// 1F52h has the date of the manifest, also for the same program sealed again. (2000-02-29 12:00 and 2026-11-27

@@ -5,20 +5,17 @@ use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::flash::FlashFault;
 use boot_core::program::Invalid;
 use coboot_tests::sealed::{
-    block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
-    CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2, START,
+    block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLEAR,
+    CLR_SIGNATURE, CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1,
+    STANDARD_2, START,
 };
+use coboot_tests::sealed_board::status::{KEY, NO_ACCESS, ROLLBACK, SIGNATURE, WRONG_PRODUCT};
 use coflash_core::file::sealed::{key_block, Certificate, Sealer};
 use kit::ihex::intel_hex;
 
-/// Statuses in 1F57h.
+/// NOT_CLEARED, NO_VALID_PROGRAM in 1F57h.
 const NOT_CLEARED: u32 = 0x08;
 const NO_PROGRAM: u32 = 0x02;
-const WRONG_PRODUCT: u32 = 0x82;
-const NO_ACCESS: u32 = 0x84;
-const SIGNATURE: u32 = 0x8A;
-const ROLLBACK: u32 = 0x8C;
-const KEY: u32 = 0x8E;
 
 fn program(len: usize, seed: u8) -> Vec<u8> {
     image(STANDARD_1.region(1), len, seed)
@@ -551,99 +548,83 @@ fn data_of_the_application_are_sealed_as_data() {
 
 // --- in between
 
+/// Something that comes at any moment of an update of program 1; `strange` is for program 2.
+type Between = fn(&mut Host<'_>, file: &[u8], strange: &[u8]);
+
+const BETWEEN: [(&str, Between); 14] = [
+    ("CLEAR of 1", |host, _, _| host.command(1, CLEAR).unwrap_or(())),
+    ("CLEAR of 2", |host, _, _| host.command(2, CLEAR).unwrap_or(())),
+    ("START of 1", |host, _, _| host.command(1, START).unwrap_or(())),
+    ("START of 2", |host, _, _| host.command(2, START).unwrap_or(())),
+    ("83h of 1", |host, _, _| host.command(1, SET_SIGNATURE).unwrap_or(())),
+    ("83h of 2", |host, _, _| host.command(2, SET_SIGNATURE).unwrap_or(())),
+    ("84h of 1", |host, _, _| host.command(1, CLR_SIGNATURE).unwrap_or(())),
+    ("84h of 2", |host, _, _| host.command(2, CLR_SIGNATURE).unwrap_or(())),
+    ("LSS store", |host, _, _| {
+        let _ = host.node.store(NodeId::new(9), Some(BitRate::K125));
+    }),
+    ("rights", |host, _, _| {
+        host.grant(&keys().root, 0xFF, 0);
+    }),
+    ("confirmation", |host, _, _| host.node.confirm(1)),
+    ("a transfer to 2", |host, _, strange| host.begin(2, &strange[..300], 7).unwrap_or(())),
+    ("a transfer to 1", |host, file, _| host.begin(1, &file[..300], 7).unwrap_or(())),
+    ("an abort", |host, _, _| host.cancel(1)),
+];
+
 /// Commands, passwords, LSS, rights and another transfer at every stage of an update: it ends as
 /// without them, or it is refused; and only authentic bytes are written to the flash of the
 /// program.
 #[test]
 fn nothing_that_comes_in_between_gets_past_the_signature() {
-    let places = [STANDARD_2.region(1), STANDARD_2.region(2)];
-    let (old, new) = (image(places[0], 600, 1), image(places[0], 1500, 2));
-    let other = image(places[1], 600, 3);
-    let device = Device::sealed(&STANDARD_2);
+    let region = STANDARD_2.region(1);
+    let (old, new) = (image(region, 600, 1), image(region, 1500, 2));
+    let other = image(STANDARD_2.region(2), 600, 3);
+    let before = Device::sealed(&STANDARD_2);
     let of = |program, image: &[u8]| {
         seal(&Sealer { program, version: image.len() as u32, chunk: 9, ..sealer((true, true)) }, image)
     };
-    device.run(|host| {
+    let (file, strange) = (of(1, &new), of(2, &other));
+    before.run(|host| {
         host.install(1, &of(1, &old));
-        host.install(2, &of(2, &other));
+        host.install(2, &strange);
     });
-    let file = of(1, &new);
-    type Action<'a> = &'a dyn Fn(&mut Host<'_>);
-    let strange = of(2, &other);
-    let actions: [(&str, Action<'_>); 14] = [
-        ("CLEAR of 1", &|host| {
-            let _ = host.command(1, 0x03);
-        }),
-        ("CLEAR of 2", &|host| {
-            let _ = host.command(2, 0x03);
-        }),
-        ("START of 1", &|host| {
-            let _ = host.command(1, START);
-        }),
-        ("START of 2", &|host| {
-            let _ = host.command(2, START);
-        }),
-        ("83h of 1", &|host| {
-            let _ = host.command(1, SET_SIGNATURE);
-        }),
-        ("83h of 2", &|host| {
-            let _ = host.command(2, SET_SIGNATURE);
-        }),
-        ("84h of 1", &|host| {
-            let _ = host.command(1, CLR_SIGNATURE);
-        }),
-        ("84h of 2", &|host| {
-            let _ = host.command(2, CLR_SIGNATURE);
-        }),
-        ("LSS store", &|host| {
-            let _ = host.node.store(NodeId::new(9), Some(BitRate::K125));
-        }),
-        ("rights", &|host| {
-            let _ = host.grant(&keys().root, 0xFF, 0);
-        }),
-        ("confirmation", &|host| host.node.confirm(1)),
-        ("a transfer to 2", &|host| {
-            let _ = host.begin(2, &strange[..300], 7);
-        }),
-        ("a transfer to 1", &|host| {
-            let _ = host.begin(1, &file[..300], 7);
-        }),
-        ("an abort", &|host| host.cancel(1)),
-    ];
+    let check = |right: bool, between: Between, at: usize, steps: u32, told: &str| {
+        let device = before.copy();
+        device.run(|host| {
+            if right {
+                assert!(host.grant(&keys().root, 0x1B, 0), "{told}");
+            }
+            host.clear(1);
+            let mut sent = host.begin(1, &file[..at], 7);
+            match steps {
+                u32::MAX => host.settle(),
+                steps => host.steps(steps),
+            }
+            between(host, &file, &strange);
+            host.steps(steps.min(40));
+            if sent.is_ok() {
+                sent = host.go_on(1, &file[at..], 7).and_then(|()| host.end(1));
+            }
+            host.settle();
+            host.node.take_boot_request();
+            let whole = device.holds(1, &new);
+            assert!(whole || device.holds(1, &old) || device.record(1).is_none(), "{told}");
+            assert!(sent.is_err() || whole || host.status(1) != 0, "{told}");
+            assert!(device.holds(2, &other), "{told}");
+            for touched in device.take_touched() {
+                assert!(region.contains(touched.base, touched.size), "{told}: {touched:?}");
+            }
+        });
+        device.run(|host| assert_eq!(host.update(1, &file, 7), (Ok(()), 0), "{told}"));
+        assert!(device.holds(1, &new), "{told}");
+    };
     for right in [false, true] {
-        for (what, action) in actions {
+        for (what, between) in BETWEEN {
             for at in (0..=file.len()).step_by(60) {
                 for steps in [0, 3, 40, u32::MAX] {
-                    let told = format!("{what} behind {at} bytes and {steps} steps, rights: {right}");
-                    let device = device.copy();
-                    device.run(|host| {
-                        if right {
-                            assert!(host.grant(&keys().root, 0x1B, 0), "{told}");
-                        }
-                        host.clear(1);
-                        let mut sent = host.begin(1, &file[..at], 7);
-                        match steps {
-                            u32::MAX => host.settle(),
-                            steps => host.steps(steps),
-                        }
-                        action(host);
-                        host.steps(steps.min(40));
-                        if sent.is_ok() {
-                            sent = host.go_on(1, &file[at..], 7).and_then(|()| host.end(1));
-                        }
-                        host.settle();
-                        host.node.take_boot_request();
-                        let whole = device.holds(1, &new);
-                        assert!(whole || device.holds(1, &old) || device.record(1).is_none(), "{told}");
-                        assert!(sent.is_err() || whole || host.status(1) != 0, "{told}");
-                        assert!(device.holds(2, &other), "{told}");
-                        let region = STANDARD_2.region(1);
-                        for touched in device.take_touched() {
-                            assert!(region.contains(touched.base, touched.size), "{told}: {touched:?}");
-                        }
-                    });
-                    device.run(|host| assert_eq!(host.update(1, &file, 7), (Ok(()), 0), "{told}"));
-                    assert!(device.holds(1, &new), "{told}");
+                    let told = format!("{what} after {at} bytes and {steps} steps, rights: {right}");
+                    check(right, between, at, steps, &told);
                 }
             }
         }

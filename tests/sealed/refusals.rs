@@ -4,21 +4,18 @@
 
 use boot_core::canopen::{AbortCode, Instant};
 use coboot_tests::sealed::{
-    certificate, image, keys, seal, sealer, Device, Parts, EPOCH, FORMS, HIGHEST, PRODUCT_CODE, REVISION,
-    STANDARD_1, UNIQUE_ID, VENDOR_ID,
+    certificate, image, keys, seal, sealer, Device, Keys, Parts, EPOCH, FORMS, HIGHEST, PRODUCT_CODE,
+    REVISION, STANDARD_1, UNIQUE_ID, VENDOR_ID,
+};
+use coboot_tests::sealed_board::status::{
+    FORMAT, KEY, NO_ACCESS, ROLLBACK, SIGNATURE, WRONG_PRODUCT as PRODUCT,
 };
 use coflash_core::file::sealed::{key_block, Certificate, Kek, Role, Sealer};
 use kit::random::Random;
 
-/// Statuses in 1F57h.
-const FORMAT: u32 = 0x04;
+/// ADDRESS, VENDOR in 1F57h.
 const ADDRESS: u32 = 0x0C;
 const VENDOR: u32 = 0x80;
-const PRODUCT: u32 = 0x82;
-const NO_ACCESS: u32 = 0x84;
-const SIGNATURE: u32 = 0x8A;
-const ROLLBACK: u32 = 0x8C;
-const KEY: u32 = 0x8E;
 
 /// The installed program: counter 5, epoch 4.
 fn installed() -> (Device, Vec<u8>) {
@@ -234,14 +231,12 @@ fn every_prefix_is_refused() {
                     host.begin(1, &good[..len], 7).unwrap();
                     if len % 2 == 0 {
                         host.cancel(1);
-                        host.settle();
-                        assert_eq!(host.status(1), FORMAT, "{len}");
                     } else {
                         assert_eq!(host.end(1), Ok(()));
-                        host.settle();
-                        assert_eq!(host.status(1), FORMAT, "{len}");
-                        assert_eq!(host.state(1), 3);
                     }
+                    host.settle();
+                    assert_eq!(host.status(1), FORMAT, "{len}");
+                    assert!(len % 2 == 0 || host.state(1) == 3);
                     if host.state(1) == 3 {
                         assert_eq!(host.start(1), None);
                     }
@@ -269,23 +264,12 @@ fn bytes_behind_the_end_are_refused() {
 
 // --- fields
 
-/// The issuer and the contents of a certificate.
-fn certified(certificate: Certificate, root: &coflash_core::file::sealed::SigningKey) -> Parts {
-    Parts::of(&next((false, false), 600).0).certified(&certificate.signed_by(root))
-}
+/// What is wrong with a file, the code for it, and the file.
+type Wrong = (String, u32, Vec<u8>);
 
-/// Correctly signed files that are for another device, or impossible.
-fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
-    let plain = Parts::of(&next((false, false), 600).0);
-    let packed = Parts::of(&next((false, true), 600).0);
-    let secret = Parts::of(&next((true, false), 600).0);
-    let own = certificate();
-    let Keys { root, second_root, release, stranger, .. } = keys();
-    let mut files = Vec::new();
-    let mut add = |what: &str, code: u32, file: Vec<u8>| files.push((what.to_string(), code, file));
-
-    // The fields of the manifest.
-    for (what, at, value, code) in [
+/// Correctly signed files whose manifest has one wrong field.
+fn wrong_fields(plain: &Parts, packed: &Parts) -> Vec<Wrong> {
+    let words = [
         ("vendor 0", 8, 0, VENDOR),
         ("another vendor", 8, VENDOR_ID + 1, VENDOR),
         ("product 0", 12, 0, PRODUCT),
@@ -302,12 +286,10 @@ fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
         ("the unique ID of nobody", 128, 1, PRODUCT),
         ("hardware revision 1", 132, 1 << 1, PRODUCT),
         ("all hardware revisions but ours", 132, !(1 << (REVISION & 31)), PRODUCT),
-    ] {
-        add(what, code, plain.clone().with(at, &u32::to_le_bytes(value)).signed());
-    }
+    ];
     let mut almost = UNIQUE_ID;
     almost[11] ^= 1;
-    for (what, at, bytes, code) in [
+    let bytes = [
         ("another unique ID", 120, &almost[..], PRODUCT),
         ("program 0", 24, &[0], PRODUCT),
         ("program 2", 24, &[2], PRODUCT),
@@ -334,155 +316,175 @@ fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
         ("a manifest of 177 bytes", 4, &[177, 0], FORMAT),
         ("a manifest of 1028 bytes", 4, &1028_u16.to_le_bytes(), FORMAT),
         ("a manifest of 65535 bytes", 4, &[255, 255], FORMAT),
-    ] {
-        add(what, code, plain.clone().with(at, bytes).signed());
-    }
+    ];
+    let wrong = |what: &str, parts: &Parts, at, bytes: &[u8], code| {
+        (what.to_string(), code, parts.clone().with(at, bytes).signed())
+    };
+    let words = words.map(|(what, at, word, code)| wrong(what, plain, at, &u32::to_le_bytes(word), code));
+    let bytes = bytes.map(|(what, at, bytes, code)| wrong(what, plain, at, bytes, code));
     let size = STANDARD_1.region(1).size;
-    for large in [size + 1, 1 << 24, u32::MAX] {
-        let file = packed.clone().with(28, &large.to_le_bytes()).signed();
-        add(&format!("an image of {large} bytes"), ADDRESS, file);
-        let file = plain.clone().with(28, &large.to_le_bytes()).with(36, &large.to_le_bytes()).signed();
-        add(&format!("an image of {large} bytes, unpacked"), ADDRESS, file);
-    }
-    for (what, at) in [("size", 28), ("payload", 36)] {
-        add(&format!("{what} 0, compressed"), FORMAT, packed.clone().with(at, &[0; 4]).signed());
-    }
+    let large = [size + 1, 1 << 24, u32::MAX].into_iter().flat_map(|large| {
+        let bytes = large.to_le_bytes();
+        let unpacked = plain.clone().with(36, &bytes);
+        [("", packed), (", unpacked", &unpacked)].map(|(form, parts)| {
+            wrong(&format!("an image of {large} bytes{form}"), parts, 28, &bytes, ADDRESS)
+        })
+    });
+    let none = [("size 0, compressed", 28), ("payload 0, compressed", 36)];
+    let none = none.map(|(what, at)| wrong(what, packed, at, &[0; 4], FORMAT));
+    words.into_iter().chain(bytes).chain(large).chain(none).collect()
+}
 
-    // Records.
-    let record = |tag, size, bytes: &[u8]| plain.clone().with_record(tag, size, bytes).signed();
-    add("an unknown critical record", FORMAT, record(0x8002, 4, &[1; 4]));
-    add("an unknown critical record without bytes", FORMAT, record(0xFFFE, 0, &[]));
-    add("a record over the end of the manifest", FORMAT, record(0x0002, 8, &[1; 4]));
-    add("a huge record", FORMAT, record(0x0002, 65535, &[1; 4]));
-    add("a recipient that is too short", FORMAT, record(0x8001, 40, &[1; 40]));
-    add("a recipient that is too long", FORMAT, record(0x8001, 48, &[1; 48]));
-    add("a recipient without bytes", FORMAT, record(0x8001, 0, &[]));
-    let unknown = secret.clone().with(180, &[1, 2, 3, 4]).signed();
-    add("encrypted for a key that is not here", KEY, unknown);
-    let zero = secret.clone().with(180, &[0; 4]).signed();
-    add("encrypted for the key 0", KEY, zero);
-    for at in [184, 191] {
-        let mut file = secret.clone();
-        file.manifest[at] ^= 1;
-        add("a wrong check of the key", KEY, file.signed());
-    }
+/// Correctly signed files with a wrong record in the manifest, or for no key of the device.
+fn wrong_records(plain: &Parts) -> Vec<Wrong> {
+    let secret = Parts::of(&next((true, false), 600).0);
+    let records: [(_, _, _, &[u8]); 7] = [
+        ("an unknown critical record", 0x8002, 4, &[1; 4]),
+        ("an unknown critical record without bytes", 0xFFFE, 0, &[]),
+        ("a record over the end of the manifest", 0x0002, 8, &[1; 4]),
+        ("a huge record", 0x0002, 65535, &[1; 4]),
+        ("a recipient that is too short", 0x8001, 40, &[1; 40]),
+        ("a recipient that is too long", 0x8001, 48, &[1; 48]),
+        ("a recipient without bytes", 0x8001, 0, &[]),
+    ];
+    let records = records.map(|(what, tag, size, bytes)| {
+        (what.to_string(), FORMAT, plain.clone().with_record(tag, size, bytes).signed())
+    });
+    let flipped = |at: usize| [secret.manifest[at] ^ 1];
+    let recipients: [(_, _, &[u8]); 4] = [
+        ("encrypted for a key that is not here", 180, &[1, 2, 3, 4]),
+        ("encrypted for the key 0", 180, &[0; 4]),
+        ("a wrong check of the key", 184, &flipped(184)),
+        ("a wrong check of the key, at its end", 191, &flipped(191)),
+    ];
+    let recipients =
+        recipients.map(|(what, at, bytes)| (what.to_string(), KEY, secret.clone().with(at, bytes).signed()));
     let other = Sealer { encrypt_for: &keys().other_keks, counter: 7, ..sealer((true, false)) };
-    let image = image(STANDARD_1.region(1), 600, 1);
-    add("encrypted for others", KEY, seal(&other, &image));
+    let other = seal(&other, &image(STANDARD_1.region(1), 600, 1));
+    records.into_iter().chain(recipients).chain([("encrypted for others".to_string(), KEY, other)]).collect()
+}
 
-    // The certificate.
-    let with = |certificate| certified(certificate, root).signed();
-    add("certified for another vendor", SIGNATURE, with(Certificate { vendor_id: 1, ..own }));
-    add("certified for vendor 0", SIGNATURE, with(Certificate { vendor_id: 0, ..own }));
-    add("certified for another product", SIGNATURE, with(Certificate { product_code: 1, ..own }));
-    add("certified for higher counters", SIGNATURE, with(Certificate { lowest: 8, ..own }));
-    add("certified for lower counters", SIGNATURE, with(Certificate { highest: 6, ..own }));
-    add("certified for none", SIGNATURE, with(Certificate { lowest: 9, highest: 1, ..own }));
-    add("of an old epoch", ROLLBACK, with(Certificate { epoch: EPOCH - 1, ..own }));
-    add("of epoch 0", ROLLBACK, with(Certificate { epoch: 0, ..own }));
-    add("certified for tests", KEY, with(Certificate { role: Role::Test, ..own }));
-    add("certified by nobody", KEY, certified(own, stranger).signed());
-    let certified_stranger = Certificate { key: stranger.public(), ..own };
-    add(
-        "another key's certificate",
-        SIGNATURE,
-        certified(certified_stranger, root).signed_by(release).bytes(),
-    );
-    let claims = |certificate: Certificate, change: &dyn Fn(&mut [u8; 152])| {
-        let mut bytes = certificate.signed_by(root);
-        change(&mut bytes);
-        // Signed again, as if the root had signed wrong contents.
+/// Correctly signed files with a wrong certificate.
+fn wrong_certificates(plain: &Parts) -> Vec<Wrong> {
+    let own = certificate();
+    let Keys { root, second_root, release, stranger, .. } = keys();
+    let certified = |certificate: Certificate, root| plain.clone().certified(&certificate.signed_by(root));
+    let mut files: Vec<Wrong> = [
+        ("certified for another vendor", SIGNATURE, Certificate { vendor_id: 1, ..own }),
+        ("certified for vendor 0", SIGNATURE, Certificate { vendor_id: 0, ..own }),
+        ("certified for another product", SIGNATURE, Certificate { product_code: 1, ..own }),
+        ("certified for higher counters", SIGNATURE, Certificate { lowest: 8, ..own }),
+        ("certified for lower counters", SIGNATURE, Certificate { highest: 6, ..own }),
+        ("certified for none", SIGNATURE, Certificate { lowest: 9, highest: 1, ..own }),
+        ("of an old epoch", ROLLBACK, Certificate { epoch: EPOCH - 1, ..own }),
+        ("of epoch 0", ROLLBACK, Certificate { epoch: 0, ..own }),
+        ("certified for tests", KEY, Certificate { role: Role::Test, ..own }),
+    ]
+    .map(|(what, code, certificate)| (what.to_string(), code, certified(certificate, root).signed()))
+    .into();
+    let mut add = |what: String, code, parts: Parts| files.push((what, code, parts.signed()));
+    add("certified by nobody".into(), KEY, certified(own, stranger));
+    // Signed again, as if the root had signed wrong contents.
+    let claims = |at: usize, contents: &[u8]| {
+        let mut bytes = own.signed_by(root);
+        bytes[at..at + contents.len()].copy_from_slice(contents);
         let signature = root.sign(&bytes[..88]);
         bytes[88..].copy_from_slice(&signature);
-        plain.clone().certified(&bytes).signed()
+        plain.clone().certified(&bytes)
     };
     for role in [0, 3, 255] {
-        add(&format!("role {role}"), SIGNATURE, claims(own, &|bytes| bytes[6] = role));
+        add(format!("role {role}"), SIGNATURE, claims(6, &[role]));
     }
     for algorithm in [0, 2, 3, 255] {
-        let file = claims(own, &|bytes| bytes[7] = algorithm);
-        add(&format!("algorithm {algorithm}"), SIGNATURE, file);
+        add(format!("algorithm {algorithm}"), SIGNATURE, claims(7, &[algorithm]));
     }
     for len in [0_u16, 151, 153, 65535] {
-        let file = claims(own, &|bytes| bytes[4..6].copy_from_slice(&len.to_le_bytes()));
-        add(&format!("a certificate of {len} bytes"), SIGNATURE, file);
+        add(format!("a certificate of {len} bytes"), SIGNATURE, claims(4, &len.to_le_bytes()));
     }
     for at in [64, 75, 87] {
-        add(&format!("reserved byte {at}"), SIGNATURE, claims(own, &|bytes| bytes[at] = 1));
+        add(format!("reserved byte {at}"), SIGNATURE, claims(at, &[1]));
     }
-    add("of the root 0", KEY, claims(own, &|bytes| bytes[60..64].fill(0)));
-    let second = second_root.public().id().to_le_bytes();
-    add("of the other root", SIGNATURE, claims(own, &|bytes| bytes[60..64].copy_from_slice(&second)));
-    let forged = own.signed_by(stranger);
-    let claimed = |mut bytes: [u8; 152]| {
-        bytes[60..64].copy_from_slice(&root.public().id().to_le_bytes());
-        plain.clone().certified(&bytes).signed()
-    };
-    add("a stranger's certificate in the root's name", SIGNATURE, claimed(forged));
+    add("of the root 0".into(), KEY, claims(60, &[0; 4]));
+    add("of the other root".into(), SIGNATURE, claims(60, &second_root.public().id().to_le_bytes()));
+    let mut claimed = own.signed_by(stranger);
+    claimed[60..64].copy_from_slice(&root.public().id().to_le_bytes());
+    let claimed = plain.clone().certified(&claimed);
+    add("a stranger's certificate in the root's name".into(), SIGNATURE, claimed);
+    let of_stranger = certified(Certificate { key: stranger.public(), ..own }, root);
+    files.push(("another key's certificate".into(), SIGNATURE, of_stranger.signed_by(release).bytes()));
+    files
+}
 
-    // Signatures.
-    add("signed by nobody", SIGNATURE, plain.clone().signed_by(stranger).bytes());
-    add("signed by the root for the release key", SIGNATURE, plain.clone().signed_by(root).bytes());
+/// Files with a wrong signature.
+fn wrong_signatures(plain: &Parts) -> Vec<Wrong> {
+    let Keys { root, release, stranger, .. } = keys();
     let bare = plain.clone().certified(&[]);
-    add("signed by the release key without certificate", KEY, bare.clone().signed_by(release).bytes());
-    let in_the_name = |signature: &[u8], of: u32| {
-        let mut parts = bare.clone();
-        parts.signatures = signature.to_vec();
-        parts.signatures[..4].copy_from_slice(&of.to_le_bytes());
-        parts.bytes()
-    };
     let strange = Parts::signature(stranger, &bare.manifest);
-    add("a stranger in the root's name", SIGNATURE, in_the_name(&strange, root.public().id()));
-    add("in the name of the key 0", KEY, in_the_name(&strange, 0));
-    for algorithm in [0_u8, 2, 3, 255] {
+    let in_the_name = |of: u32| {
+        let mut parts = Parts { signatures: strange.clone(), ..bare.clone() };
+        parts.signatures[..4].copy_from_slice(&of.to_le_bytes());
+        parts
+    };
+    let changed = |change: &dyn Fn(&mut Vec<u8>)| {
         let mut parts = plain.clone().signed_by(release);
-        parts.signatures[4] = algorithm;
-        add(&format!("signature algorithm {algorithm}"), SIGNATURE, parts.bytes());
-    }
-    for bytes in [0, 63] {
-        let mut parts = plain.clone().signed_by(release);
-        parts.signatures[6] = bytes;
-        parts.signatures.truncate(8 + usize::from(bytes));
-        add(&format!("a signature of {bytes} bytes"), SIGNATURE, parts.bytes());
-    }
-    for bytes in [8000_u16, 65535] {
-        let mut parts = plain.clone().signed_by(release);
-        parts.signatures[6..8].copy_from_slice(&bytes.to_le_bytes());
-        parts.signatures.resize(8 + usize::from(bytes), 0x5A);
-        add(&format!("a signature of {bytes} bytes"), FORMAT, parts.bytes());
-    }
+        change(&mut parts.signatures);
+        parts
+    };
     // Two signatures with the id of the key: the first one counts, and it is bad.
     let mut two = plain.clone().with(6, &[2]).signed_by(release);
     let mut bad = two.signatures.clone();
     bad[20] ^= 1;
     two.signatures = [bad, two.signatures].concat();
-    add("a bad signature in front of a good one", SIGNATURE, two.bytes());
-    // S + L in place of S (RFC 8032 section 5.1.7 accepts no S of L or more).
-    let mut malleable = plain.clone().signed_by(release);
+    let mut files = vec![
+        ("signed by nobody".to_string(), SIGNATURE, plain.clone().signed_by(stranger)),
+        ("signed by the root for the release key".into(), SIGNATURE, plain.clone().signed_by(root)),
+        ("signed by the release key without certificate".into(), KEY, bare.clone().signed_by(release)),
+        ("a stranger in the root's name".into(), SIGNATURE, in_the_name(root.public().id())),
+        ("in the name of the key 0".into(), KEY, in_the_name(0)),
+        ("a bad signature in front of a good one".into(), SIGNATURE, two),
+        ("a signature with S + L".into(), SIGNATURE, changed(&|bytes| add_order(&mut bytes[40..72]))),
+    ];
+    for algorithm in [0_u8, 2, 3, 255] {
+        let parts = changed(&|bytes| bytes[4] = algorithm);
+        files.push((format!("signature algorithm {algorithm}"), SIGNATURE, parts));
+    }
+    for (len, code) in [(0_u16, SIGNATURE), (63, SIGNATURE), (8000, FORMAT), (65535, FORMAT)] {
+        let parts = changed(&|bytes| {
+            bytes[6..8].copy_from_slice(&len.to_le_bytes());
+            bytes.resize(8 + usize::from(len), 0x5A);
+        });
+        files.push((format!("a signature of {len} bytes"), code, parts));
+    }
+    files.into_iter().map(|(what, code, parts)| (what, code, parts.bytes())).collect()
+}
+
+/// S + L in place of S (RFC 8032 section 5.1.7 accepts no S of L or more).
+fn add_order(s: &mut [u8]) {
     let order = [
         0xed, 0xd3, 0xf5, 0x5c, 0x1a, 0x63, 0x12, 0x58, 0xd6, 0x9c, 0xf7, 0xa2, 0xde, 0xf9, 0xde, 0x14, 0, 0,
         0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x10,
     ];
     let mut carry = 0_u16;
-    for (byte, order) in malleable.signatures[40..72].iter_mut().zip(order) {
+    for (byte, order) in s.iter_mut().zip(order) {
         carry += u16::from(*byte) + order;
         *byte = carry as u8;
         carry >>= 8;
     }
-    add("a signature with S + L", SIGNATURE, malleable.bytes());
-
-    // The first chunk.
-    let mut parts = plain.clone();
-    parts.chunks.rotate_left(1);
-    add("a chunk that is shifted", SIGNATURE, parts.bytes());
-    add("the chunks of another image", SIGNATURE, {
-        let others = Parts::of(&next((false, true), 600).0).chunks;
-        Parts { chunks: others, ..plain.clone() }.bytes()
-    });
-    files
 }
 
-use coboot_tests::sealed::Keys;
+/// Correctly signed files that are for another device, or impossible.
+fn signed_and_wrong() -> Vec<Wrong> {
+    let plain = Parts::of(&next((false, false), 600).0);
+    let packed = Parts::of(&next((false, true), 600).0);
+    let mut shifted = plain.clone();
+    shifted.chunks.rotate_left(1);
+    let others = Parts { chunks: packed.chunks.clone(), ..plain.clone() };
+    let chunks = [("a chunk that is shifted", shifted), ("the chunks of another image", others)]
+        .map(|(what, parts)| (what.to_string(), SIGNATURE, parts.bytes()));
+    let manifest = [wrong_fields(&plain, &packed), wrong_records(&plain)];
+    let signers = [wrong_certificates(&plain), wrong_signatures(&plain), chunks.into()];
+    manifest.into_iter().chain(signers).flatten().collect()
+}
 
 #[test]
 fn a_good_signature_does_not_make_a_wrong_field_right() {
@@ -545,29 +547,24 @@ fn a_stream_that_is_wrong_ends_without_a_program() {
     let (good, image) = next((false, true), 3000);
     let parts = Parts::of(&good);
     let payload = parts.payload();
-    let cut = |len: usize| parts.clone().with_payload(&payload[..len]);
-    let mut files = vec![
-        ("half a stream".to_string(), cut(payload.len() / 2)),
-        ("a byte alone".to_string(), cut(1)),
-        ("five bytes".to_string(), cut(5)),
-        ("all zeros".to_string(), parts.clone().with_payload(&[0; 3000])),
-        ("all FFh".to_string(), parts.clone().with_payload(&[0xFF; 3000])),
-        ("a first byte that is not 0".to_string(), {
-            let mut wrong = payload.clone();
-            wrong[0] = 1;
-            parts.clone().with_payload(&wrong)
-        }),
-        ("much behind its end".to_string(), parts.clone().with_payload(&[&payload[..], &[0; 600]].concat())),
-        ("an image larger than the stream".to_string(), parts.clone().with(28, &9000_u32.to_le_bytes())),
-        ("an image smaller than the stream".to_string(), parts.clone().with(28, &1000_u32.to_le_bytes())),
-        ("another CRC".to_string(), parts.clone().with(32, &[1, 2, 3, 4])),
-        ("another hash".to_string(), parts.clone().with(40, &[1, 2, 3, 4])),
-    ];
-    // A match before the first byte: a 0 as LZMA requires, and then bits that are 1.
-    files.push((
-        "a match with nothing".to_string(),
-        parts.clone().with_payload(&[&[0][..], &[0xFE; 90]].concat()),
-    ));
+    let with = |bytes: &[u8]| parts.clone().with_payload(bytes);
+    let mut files: Vec<_> = [
+        ("half a stream", with(&payload[..payload.len() / 2])),
+        ("a byte alone", with(&payload[..1])),
+        ("five bytes", with(&payload[..5])),
+        ("all zeros", with(&[0; 3000])),
+        ("all FFh", with(&[0xFF; 3000])),
+        ("a first byte that is not 0", with(&[&[1], &payload[1..]].concat())),
+        ("much behind its end", with(&[&payload[..], &[0; 600]].concat())),
+        ("an image larger than the stream", parts.clone().with(28, &9000_u32.to_le_bytes())),
+        ("an image smaller than the stream", parts.clone().with(28, &1000_u32.to_le_bytes())),
+        ("another CRC", parts.clone().with(32, &[1, 2, 3, 4])),
+        ("another hash", parts.clone().with(40, &[1, 2, 3, 4])),
+        // A match before the first byte: a 0 as LZMA requires, and then bits that are 1.
+        ("a match with nothing", with(&[&[0][..], &[0xFE; 90]].concat())),
+    ]
+    .map(|(what, parts)| (what.to_string(), parts))
+    .into();
     let mut random = Random(11);
     for number in 0..150 {
         let mut wrong = payload.clone();
@@ -575,7 +572,7 @@ fn a_stream_that_is_wrong_ends_without_a_program() {
             let at = random.below(wrong.len());
             wrong[at] ^= 1 << random.below(8);
         }
-        files.push((format!("stream {number} of seed 11"), parts.clone().with_payload(&wrong)));
+        files.push((format!("stream {number} of seed 11"), with(&wrong)));
     }
     let region = STANDARD_1.region(1);
     let journal = STANDARD_1.layout.parameters;

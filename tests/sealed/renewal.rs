@@ -10,7 +10,9 @@ use coboot_tests::renewal::{
     cells, confirm, crc_of, identification, image_of, number, progress, running, start, status as refusal,
     version, with_crc,
 };
-use coboot_tests::sealed_board::{board, key, provision, release, root, sealer, status, write_to, COUNTER};
+use coboot_tests::sealed_board::{
+    board, key, provision, release, root, seal, sealer, status, write_to, COUNTER,
+};
 use coflash_core::device::info::info;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::device::Transfers;
@@ -252,12 +254,7 @@ fn a_package_renews_a_sealed_device_and_an_open_one_and_updates_both() {
     let parts = [
         part("sealed bootloader", 1, BOOTLOADER, sealed(2, of_sealed)),
         part("bootloader", 2, BOOTLOADER, version(firmware::BOOTLOADER, of_open)),
-        part(
-            "sealed program",
-            1,
-            1,
-            sealer(COUNTER).seal(&firmware::raw(firmware::APP_V1), &release()).unwrap(),
-        ),
+        part("sealed program", 1, 1, seal(&sealer(COUNTER), firmware::APP_V1)),
         part("program", 2, 1, block_file::emit(&firmware::blocks(firmware::APP_V1))),
     ];
     let package = Package::parse(&make(None, None, &parts, &[(&root(), None)]).unwrap()).unwrap();

@@ -10,7 +10,7 @@ use coboot_tests::sealed::{
 };
 use coboot_tests::sealed_board::status;
 use coflash_core::file::sealed::{Certificate, Sealer};
-use seal::access::{event, right, EVENTS};
+use seal::access::{event, right};
 use shared_abi::warm_start::BootRequest;
 
 /// Operations of the flash for a record: the journal's slot (docs/adr/0004).
@@ -53,12 +53,7 @@ fn refused_files(setup: &Setup, program: u8) -> Vec<(u32, Vec<u8>)> {
 
 /// The events of 2003h, the latest first.
 fn log(host: &mut Host<'_>) -> Vec<[u32; 4]> {
-    let mut event = |sub| {
-        let mut bytes = [0; 16];
-        assert_eq!(host.node.read(Address::new(0x2003, sub), &mut bytes), Ok(16));
-        [0, 4, 8, 12].map(|at| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()))
-    };
-    (1..=EVENTS as u8).map(&mut event).filter(|event| event[0] > 0).collect()
+    host.log().into_iter().filter(|event| event[0] > 0).collect()
 }
 
 /// The operations of the flash since the last call: in the journal, and elsewhere.

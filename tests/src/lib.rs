@@ -10,7 +10,6 @@ pub mod firmware;
 pub mod fleet;
 pub mod listener;
 pub mod masters;
-pub mod node;
 pub mod powercut;
 mod products;
 pub mod renewal;

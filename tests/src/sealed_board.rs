@@ -7,13 +7,16 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coflash_core::device::{Doing, Transfers};
 use coflash_core::file::sealed::{key_block, Certificate, Kek, Role, Sealer, SigningKey};
+use kit::rig::crc32;
 
-use crate::bench::{abort_code, Bench};
+use crate::bench::{abort_code, Bench, NODE};
 use crate::firmware;
 
 /// 1F50h/1 and 1F57h/1.
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
+const VERSION: Address = Address::new(0x100A, 0);
+const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
 
 /// The words of 1F57h: the error code from bit 1 on (SYS TEC manual, table 3; from 8Ah on the codes
 /// of sealed images).
@@ -114,6 +117,40 @@ pub fn board_of(bootloader: &str) -> Bench {
 pub fn provision(bench: &mut Bench) {
     let place = firmware::board().key_block();
     bench.machine().load_bin(place.base, &keys()).expect("it is in flash");
+}
+
+/// An application as a sealed image, signed by [`release`].
+pub fn seal(sealer: &Sealer<'_>, image: &str) -> Vec<u8> {
+    sealer.seal(&firmware::raw(image), &release()).expect("it can be sealed")
+}
+
+/// Starts the downloaded program, and checks that it is the right one.
+pub fn start(bench: &mut Bench, image: &str, version: &str) {
+    let crc = bench.session().read_number(CRC_OF_PROGRAM).unwrap();
+    assert_eq!(crc, crc32(&firmware::raw(image)));
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    assert!(!bench.is_bootloader(NODE), "{image} was not started");
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), version);
+    assert_eq!(bench.session().read_number(CRC_OF_PROGRAM).unwrap(), crc);
+}
+
+/// Stops the program: the device returns to the bootloader, which confirms the program. (The first
+/// 80h after a download in one transfer would mean "confirm".)
+pub fn call_back(bench: &mut Bench) {
+    bench.session().command(1, ProgramControl::Stop).unwrap();
+    bench.run_ms(100);
+    assert!(bench.is_bootloader(NODE));
+}
+
+/// A sealed device in its bootloader, with version 1 installed, started once and confirmed.
+pub fn board_with_a_program() -> Bench {
+    let mut bench = board().switched_on();
+    let file = seal(&sealer(COUNTER), firmware::APP_V1);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+    call_back(&mut bench);
+    bench
 }
 
 /// The key block of the devices.

@@ -2,7 +2,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -38,12 +38,14 @@ fn means() -> Means<'static> {
     Means::of(Duration::from_millis(500))
 }
 
+/// The answer that is heard in place of this one, to this request.
+type Answer<'a> = &'a dyn Fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>;
+
 /// A board whose power the checks can switch, with a fault between it and the bus.
 struct Faulty<'b> {
     bench: &'b mut Bench,
     power: Rc<Cell<Option<bool>>>,
-    /// The answer that is heard in place of this one, to this request.
-    answer: fn(asked: [u8; 8], answer: [u8; 8]) -> Option<[u8; 8]>,
+    answer: Answer<'b>,
     asked: [u8; 8],
 }
 
@@ -79,10 +81,7 @@ impl Adapter for Faulty<'_> {
 }
 
 /// The checks with a program, on a board with this fault; with what it runs at the end.
-fn with_a_program(
-    silicon: Silicon,
-    answer: fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>,
-) -> (Vec<String>, Vec<String>, Option<u32>) {
+fn with_a_program(silicon: Silicon, answer: Answer<'_>) -> (Vec<String>, Vec<String>, Option<u32>) {
     let mut bench = Bench::with(Options { silicon, ..Options::default() }).switched_on();
     let program = Arc::new(firmware::blocks(firmware::APP_V1));
     let crc = program.crc();
@@ -108,7 +107,7 @@ fn with_a_program(
 /// On the worst chip; the test below shows the same on a typical one.
 #[test]
 fn updates_pass_and_the_image_runs_at_the_end() {
-    let (failed, skipped, runs) = with_a_program(WORST, |_, answer| Some(answer));
+    let (failed, skipped, runs) = with_a_program(WORST, &|_, answer| Some(answer));
     assert_eq!((&failed[..], &skipped[..]), (&[][..], &[][..]));
     assert!(runs.is_some());
 }
@@ -116,7 +115,7 @@ fn updates_pass_and_the_image_runs_at_the_end() {
 #[test]
 fn faults_of_updates_are_found() {
     // Another CRC of the running program, and of an erased one.
-    let (failed, ..) = with_a_program(TYPICAL, |asked, mut answer| {
+    let (failed, ..) = with_a_program(TYPICAL, &|asked, mut answer| {
         if asked[..4] == [0x40, 0x56, 0x1F, 1] && answer[0] == 0x43 {
             answer[4] ^= 1;
         }
@@ -128,13 +127,13 @@ fn faults_of_updates_are_found() {
     );
     // Silent while it is busy: status words with bit 0 are not heard. The next check meets the same
     // erase.
-    let (failed, ..) = with_a_program(TYPICAL, |asked, answer| {
+    let (failed, ..) = with_a_program(TYPICAL, &|asked, answer| {
         let busy = asked[..4] == [0x40, 0x57, 0x1F, 1] && answer[0] == 0x43 && answer[4] & 1 != 0;
         (!busy).then_some(answer)
     });
     assert_eq!(ids(&failed), ["UPD-005", "UPD-006"]);
     // An error is never reported.
-    let (failed, ..) = with_a_program(TYPICAL, |asked, mut answer| {
+    let (failed, ..) = with_a_program(TYPICAL, &|asked, mut answer| {
         if asked[..4] == [0x40, 0x57, 0x1F, 1] && answer[0] == 0x43 {
             answer[4] &= 1;
         }
@@ -177,7 +176,7 @@ fn the_bootloader_passes() {
 }
 
 /// The checks of the bootloader's own number, on a board with this fault.
-fn of_renewal(answer: fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>) -> (Vec<String>, Vec<String>, Vec<Operation>) {
+fn of_renewal(answer: Answer<'_>) -> (Vec<String>, Vec<String>, Vec<Operation>) {
     let mut bench = Bench::new().switched_on();
     bench.machine().keep_flash_log();
     let all: Vec<_> = checks().into_iter().filter(|check| check.group() == "REN").collect();
@@ -199,70 +198,61 @@ fn faults_of_the_bootloaders_own_number_are_found() {
     if firmware::board().staging.is_none() {
         return;
     }
-    let (failed, skipped, log) = of_renewal(|_, answer| Some(answer));
+    let (failed, skipped, log) = of_renewal(&|_, answer| Some(answer));
     assert_eq!((&failed[..], &skipped[..], &log[..]), (&[][..], &[][..], &[][..]), "and it writes nothing");
 
-    let found = |answer| ids(&of_renewal(answer).0).into_iter().map(str::to_owned).collect::<Vec<_>>();
-    // 1F51h/0 ends before it.
-    let all = found(|asked, mut answer| {
-        answer[4] -= u8::from(reads(asked, 0x1F51, 0));
-        Some(answer)
-    });
-    assert_eq!(all, ["REN-001"]);
-    // 1F51h/2 reads "stopped", and 1F56h/2 a program that is not there.
-    let all = found(|asked, mut answer| {
-        if reads(asked, 0x1F51, 2) || reads(asked, 0x1F56, 2) {
-            answer[4..].fill(0);
+    let all = ["REN-004", "REN-005", "REN-006", "REN-007", "REN-008", "REN-009", "REN-010", "REN-011"];
+    // A command changes what an object reads.
+    let changed = |index, sub, asked, mut answer: [u8; 8], reads: &Cell<u8>| {
+        if self::reads(asked, index, sub) {
+            // The reset or the damage of the last trial; the CRC.
+            answer[7] = reads.replace(reads.get().wrapping_add(1)) % 4;
+            answer[6] = if index == 0x2007 { 3 } else { answer[6] };
         }
         Some(answer)
-    });
-    assert_eq!(all, ["REN-002", "REN-003"]);
-    // Each command changes what 2007h/9, or 1F56h/2, reads.
-    for index in [0x2007, 0x1F56] {
-        static READS: AtomicU8 = AtomicU8::new(0);
-        static INDEX: AtomicU16 = AtomicU16::new(0);
-        INDEX.store(index, Ordering::Relaxed);
-        let all = found(|asked, mut answer| {
-            let index = INDEX.load(Ordering::Relaxed);
-            if reads(asked, index, if index == 0x2007 { 9 } else { 2 }) {
-                // The reset or the damage of the last trial; the CRC.
-                answer[7] = READS.fetch_add(1, Ordering::Relaxed) % 4;
-                answer[6] = if index == 0x2007 { 3 } else { answer[6] };
-            }
-            Some(answer)
-        });
-        let expected =
-            ["REN-004", "REN-005", "REN-006", "REN-007", "REN-008", "REN-009", "REN-010", "REN-011"];
-        assert_eq!(all, expected, "{index:04X}h");
-    }
-    // The commands are refused.
-    let all = found(|asked, answer| {
-        let refused = [0x80, 0x51, 0x1F, 2, 0x30, 0, 0x09, 0x06];
-        Some(if asked[..4] == [0x2F, 0x51, 0x1F, 2] { refused } else { answer })
-    });
-    assert_eq!(all, ["REN-004", "REN-005", "REN-006", "REN-007", "REN-008", "REN-009", "REN-010", "REN-011"]);
-    // 1F57h/2 never reports an error; then another one than the right one.
-    for error in [0x00, 0x06] {
-        static ERROR: AtomicU8 = AtomicU8::new(0);
-        ERROR.store(error, Ordering::Relaxed);
-        let all = found(|asked, mut answer| {
-            if reads(asked, 0x1F57, 2) && answer[4] > 1 {
-                answer[4] = ERROR.load(Ordering::Relaxed);
-            }
-            Some(answer)
-        });
-        assert_eq!(all, ["REN-009", "REN-010", "REN-011"], "{error:02X}h");
-    }
-    // The bootloader leaves after START: 1000h reads that of an application.
-    let all = found(|asked, mut answer| {
-        static STARTED: AtomicBool = AtomicBool::new(false);
-        STARTED.fetch_or(asked[..5] == [0x2F, 0x51, 0x1F, 2, 1], Ordering::Relaxed);
-        if reads(asked, 0x1000, 0) && STARTED.swap(false, Ordering::Relaxed) {
-            answer[4..].fill(0);
+    };
+    // 1F57h/2 reads this in place of an error.
+    let error = |error, asked, mut answer: [u8; 8]| {
+        if reads(asked, 0x1F57, 2) && answer[4] > 1 {
+            answer[4] = error;
         }
         Some(answer)
-    });
-    assert_eq!(all, ["REN-009"]);
+    };
+    let (count, is_started) = (Cell::new(0), Cell::new(false));
+    let faults: [(&str, &[&str], Answer<'_>); 8] = [
+        ("1F51h/0 ends before it", &["REN-001"], &|asked, mut answer| {
+            answer[4] -= u8::from(reads(asked, 0x1F51, 0));
+            Some(answer)
+        }),
+        (
+            "1F51h/2 reads \"stopped\", and 1F56h/2 a program that is not there",
+            &["REN-002", "REN-003"],
+            &|asked, mut answer| {
+                if reads(asked, 0x1F51, 2) || reads(asked, 0x1F56, 2) {
+                    answer[4..].fill(0);
+                }
+                Some(answer)
+            },
+        ),
+        ("2007h/9 changes", &all, &|asked, answer| changed(0x2007, 9, asked, answer, &count)),
+        ("1F56h/2 changes", &all, &|asked, answer| changed(0x1F56, 2, asked, answer, &count)),
+        ("the commands are refused", &all, &|asked, answer| {
+            let refused = [0x80, 0x51, 0x1F, 2, 0x30, 0, 0x09, 0x06];
+            Some(if asked[..4] == [0x2F, 0x51, 0x1F, 2] { refused } else { answer })
+        }),
+        ("no error is reported", &all[5..], &|asked, answer| error(0, asked, answer)),
+        ("another error is reported", &all[5..], &|asked, answer| error(6, asked, answer)),
+        ("it leaves after START: 1000h reads that of an application", &["REN-009"], &|asked, mut answer| {
+            is_started.set(is_started.get() || asked[..5] == [0x2F, 0x51, 0x1F, 2, 1]);
+            if reads(asked, 0x1000, 0) && is_started.take() {
+                answer[4..].fill(0);
+            }
+            Some(answer)
+        }),
+    ];
+    for (what, expected, answer) in faults {
+        assert_eq!(ids(&of_renewal(answer).0), expected, "{what}");
+    }
 }
 
 /// A device in the middle of a renewal is left alone: 84h would give the image on trial up.
@@ -272,11 +262,9 @@ fn a_device_in_the_middle_of_a_renewal_is_left_alone() {
         return;
     }
     for progress in [[1, 0, 0, 0], [1, 1, 0, 0], [2, 2, 0, 0]] {
-        static PROGRESS: AtomicU32 = AtomicU32::new(0);
-        PROGRESS.store(u32::from_le_bytes(progress), Ordering::Relaxed);
-        let (failed, skipped, log) = of_renewal(|asked, mut answer| {
+        let (failed, skipped, log) = of_renewal(&|asked, mut answer| {
             if reads(asked, 0x2007, 9) {
-                answer[4..].copy_from_slice(&PROGRESS.load(Ordering::Relaxed).to_le_bytes());
+                answer[4..].copy_from_slice(&progress);
             }
             assert_ne!(asked[..3], [0x2F, 0x51, 0x1F], "no command is sent");
             Some(answer)

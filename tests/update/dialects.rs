@@ -21,24 +21,16 @@ fn bench(bootloader: &str) -> Bench {
 }
 
 #[test]
-fn a_master_that_knows_cia_302_alone() {
-    let mut bench = bench(firmware::BOOTLOADER);
-    script::play(&mut bench, "cia302.candump");
-    bench.assert_nothing_unmodelled();
-}
-
-#[test]
-fn a_master_that_knows_paulus() {
-    let mut bench = bench(firmware::BOOTLOADER_PAULUS);
-    script::play(&mut bench, "paulus.candump");
-    bench.assert_nothing_unmodelled();
-}
-
-#[test]
-fn a_master_that_knows_the_boot_loader_of_esacademy() {
-    let mut bench = bench(firmware::BOOTLOADER_ESACADEMY);
-    script::play(&mut bench, "esacademy.candump");
-    bench.assert_nothing_unmodelled();
+fn a_master_that_knows_one_dialect_alone() {
+    for (bootloader, recording) in [
+        (firmware::BOOTLOADER, "cia302.candump"),
+        (firmware::BOOTLOADER_PAULUS, "paulus.candump"),
+        (firmware::BOOTLOADER_ESACADEMY, "esacademy.candump"),
+    ] {
+        let mut bench = bench(bootloader);
+        script::play(&mut bench, recording);
+        bench.assert_nothing_unmodelled();
+    }
 }
 
 /// The boards with a region for a set of parameters have the chip of one board.

@@ -4,12 +4,14 @@
 
 use std::time::Duration;
 
+use boot_core::profile::Profile;
 use canopen::{Address, BitRate};
 use coboot_node::device::Event;
+use coboot_tests::attacker::node::Node;
+use coboot_tests::attacker::target::Target as _;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::masters::{confirm, lely, simple, systec, zephyr, Master};
-use coboot_tests::node::NodeBus;
 use coboot_tests::renewal::{crc_of, identification, number, progress, running, version};
 use coflash_core::device::Transfers;
 use coflash_core::file::convert::{program_of, Options};
@@ -91,13 +93,16 @@ fn program(first: u8) -> Vec<u8> {
 /// Both against `coboot-node` with its stand-in for the program.
 #[test]
 fn both_masters_update_a_node_without_a_chip() {
-    let mut node = NodeBus::new("masters");
+    let mut node = Node::new(&Profile::STANDARD);
+    // It has booted.
+    node.pass_us(1000);
     // Twice: the second time from the running program.
     for first in [1, 2] {
         let done = zephyr(&mut node, NODE, 1, &program(first)).unwrap();
         assert!(done.answers[0] <= Duration::from_millis(25), "{:?}", done.answers);
-        node.run(Duration::from_millis(100));
-        let last = *node.events.last().unwrap();
+        node.pass_us(100_000);
+        node.events();
+        let last = node.result.unwrap();
         assert!(matches!(last, Event::Program { trial: false, .. }), "confirmed, not called back: {last:?}");
     }
     let image = program(3);

@@ -8,8 +8,9 @@
 use core::task::Poll;
 
 use canopen::lss::{BitRate, Config, Lss, LssAddress, LssDevice, Output, StoreError};
-use canopen::{CobId, Frame, Instant, NodeId};
+use canopen::{CobId, Frame, NodeId};
 use coboot_fuzz::{Input, ENDLESS};
+use kit::bus::at;
 
 const ADDRESS: LssAddress = LssAddress {
     vendor_id: 0x0000_0123,
@@ -61,9 +62,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                 lss.handle(&request([command, a, b, c, d, bits, part, next]), at(now), &mut device);
             }
             150..=159 => {
-                let Some([low, high, len]) = input.array() else { break };
-                let id = CobId::new(u16::from_le_bytes([low, high]) & 0x7FF).expect("11 bits");
-                lss.handle(&Frame::of(id, input.take(usize::from(len) % 9)), at(now), &mut device);
+                let Some(frame) = input.frame() else { break };
+                lss.handle(&frame, at(now), &mut device);
             }
             160..=199 => fetch(&mut lss, now),
             200..=210 => {
@@ -95,20 +95,11 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     assert_eq!(device.stored, Some((NodeId::new(0x2A), Some(BitRate::K500))));
     for (i, part) in (0_u8..).zip(PARTS) {
         let [a, b, c, d] = part.to_le_bytes();
-        ask(
-            &mut lss,
-            &mut device,
-            now,
-            [0x5A + i, 0, 0, 0, 0, 0, 0, 0],
-            Some([0x5A + i, a, b, c, d, 0, 0, 0]),
-        );
+        let told = Some([0x5A + i, a, b, c, d, 0, 0, 0]);
+        ask(&mut lss, &mut device, now, [0x5A + i, 0, 0, 0, 0, 0, 0, 0], told);
     }
     assert_eq!(lss.reset_communication(), NodeId::new(0x2A));
 });
-
-fn at(millis: u32) -> Instant {
-    Instant::from_millis(millis)
-}
 
 fn request(bytes: [u8; 8]) -> Frame {
     Frame::of(CobId::LSS_REQUEST, &bytes)

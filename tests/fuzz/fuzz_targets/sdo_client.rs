@@ -5,7 +5,7 @@
 #![cfg_attr(fuzzing, no_main)]
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};
-use canopen::{AbortCode, Address, CobId, Frame};
+use canopen::{AbortCode, Address, CobId};
 use coboot_fuzz::{Input, ENDLESS};
 use kit::bus::{at, node, response};
 
@@ -77,9 +77,8 @@ fn drive(transfer: &mut impl Transfer, mut input: Input<'_>) -> (bool, u32) {
                 transfer.handle(&response([command, 0x00, 0x20, 0, a, b, c, d]), at(now));
             }
             150..=159 => {
-                let Some([low, high, len]) = input.array() else { break };
-                let id = CobId::new(u16::from_le_bytes([low, high]) & 0x7FF).expect("11 bits");
-                transfer.handle(&Frame::of(id, input.take(usize::from(len) % 9)), at(now));
+                let Some(frame) = input.frame() else { break };
+                transfer.handle(&frame, at(now));
             }
             160..=239 => send(transfer, now, &mut ended),
             240..=254 => now += u32::from(action - 239) * 20,

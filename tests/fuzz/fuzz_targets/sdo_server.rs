@@ -10,7 +10,7 @@
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Upload};
 use canopen::sdo::server::Config as SdoConfig;
-use canopen::{Address, CobId, Frame};
+use canopen::{Address, CobId};
 use coboot_fuzz::{drain, run, Input};
 use kit::bus::{at, node, request, Device};
 
@@ -46,9 +46,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
             }
             // Any frame of any length.
             160..=179 => {
-                let Some([low, high, len]) = input.array() else { break };
-                let id = CobId::new(u16::from_le_bytes([low, high]) & 0x7FF).expect("11 bits");
-                slave.handle(&Frame::of(id, input.take(usize::from(len) % 9)), at(now), &mut device);
+                let Some(frame) = input.frame() else { break };
+                slave.handle(&frame, at(now), &mut device);
             }
             180..=209 => {
                 if let Some(frame) = slave.poll(at(now), &mut device) {

@@ -29,14 +29,11 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let block = Block { blksize: client_blksize % 127 + 1, pst, repeat_ms: 300 };
     let config = ClientConfig::default();
     match kind & 3 {
-        0 => {
-            let mut download = Download::new(node(), AT, &data, config);
-            if drive(&mut download, &mut slave, &mut device, input).is_ok() {
-                assert_eq!(device.domain, data);
-            }
-        }
-        1 => {
-            let mut download = Download::as_blocks(node(), AT, &data, config);
+        kind @ 0..=1 => {
+            let mut download = match kind {
+                0 => Download::new(node(), AT, &data, config),
+                _ => Download::as_blocks(node(), AT, &data, config),
+            };
             if drive(&mut download, &mut slave, &mut device, input).is_ok() {
                 assert_eq!(device.domain, data);
             }

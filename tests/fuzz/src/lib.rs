@@ -61,7 +61,7 @@ impl Drop for Told<'_> {
 use canopen::node::Node;
 use canopen::sdo::client::{Step, Transfer};
 use canopen::sdo::SdoError;
-use canopen::Instant;
+use canopen::{CobId, Frame, Instant};
 use kit::bus::Device;
 
 /// The fuzzer's bytes, consumed from the front.
@@ -93,6 +93,13 @@ impl<'a> Input<'a> {
         let (first, rest) = self.0.split_at(most.min(self.0.len()));
         self.0 = rest;
         first
+    }
+
+    /// Any frame with 11 bits and up to eight bytes; `None` at the end.
+    pub fn frame(&mut self) -> Option<Frame> {
+        let [low, high, len] = self.array()?;
+        let id = CobId::new(u16::from_le_bytes([low, high]) & 0x7FF).expect("11 bits");
+        Some(Frame::of(id, self.take(usize::from(len) % 9)))
     }
 
     /// The remaining bytes.

@@ -17,7 +17,7 @@ use seal::access::right;
 use sha2::block_api::compress512;
 use sha2::Sha512;
 
-use super::{call_back, kinds, start, status};
+use super::{call_back, kinds, seal, start, status};
 
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const READ_STATUS: [u8; 8] = [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0];
@@ -218,10 +218,10 @@ fn the_bootloader_is_there_as_soon_as_an_open_one() {
     let mut bench = board();
     bench.power_on();
     let power_on = bench.await_boot_up(100) - Time(0);
-    let file = sealer(COUNTER).seal(&firmware::raw(firmware::APP_V1), &release()).expect("it can be sealed");
+    let file = seal(&sealer(COUNTER), firmware::APP_V1);
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     start(&mut bench, firmware::APP_V1, "1.0.0");
-    super::call_back(&mut bench);
+    call_back(&mut bench);
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();

@@ -1,24 +1,23 @@
 //! The built firmware in the emulator.
 
+use attack::device::{Action, Trouble};
 use canopen::Frame;
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::bus::Outcome;
 use emulator::machine::{Cut, FlashCut, ResetCause, Stop};
 use emulator::time::{Span, Time};
 use emulator::world::PortId;
+use kit::model::Cut as ModelCut;
 use shared_abi::layout::Layout;
 
-use super::target::{Event, Happened, PowerCut, Target};
+use super::target::{Event, Happened, Target, OFF_US};
 use crate::bench::{convert, Bench, BIT_RATE};
 
 /// A board on a bus with two masters.
 pub struct Board {
     /// The bench of the board.
     pub bench: Bench,
-    layout: &'static Layout,
     masters: [PortId; 2],
-    /// Events of the machine that belong between frames.
-    cuts: u64,
     /// Frames of the masters so far.
     sent: u64,
 }
@@ -32,12 +31,12 @@ impl Board {
     /// # Panics
     /// Never: the key block is in flash.
     #[must_use]
-    pub fn new(layout: &'static Layout, bootloader: &str, keys: &[u8]) -> Self {
+    pub fn new(layout: &Layout, bootloader: &str, keys: &[u8]) -> Self {
         let mut bench = Bench::of_image(bootloader);
         bench.machine().load_bin(layout.key_block().base, keys).expect("it is in flash");
         let masters = [0; 2].map(|_| bench.world.add_host_port(BIT_RATE));
         bench.power_on();
-        Self { bench, layout, masters, cuts: 0, sent: 0 }
+        Self { bench, masters, sent: 0 }
     }
 }
 
@@ -51,10 +50,6 @@ fn micros(at: Time) -> u64 {
 }
 
 impl Target for Board {
-    fn layout(&self) -> &'static Layout {
-        self.layout
-    }
-
     fn now_us(&self) -> u64 {
         micros(self.bench.time())
     }
@@ -133,29 +128,35 @@ impl Target for Board {
         (counters.sectors_erased + counters.units_programmed, busy)
     }
 
-    fn disturb(&mut self, frames: u64) {
-        self.bench.world.clear_faults();
-        let mine = FrameMatch { from: Some(self.bench.device.node()), ..FrameMatch::default() };
-        for n in 1..=frames {
-            let fault = Fault { frames: mine.clone(), when: When::Nth(n), action: FaultAction::Disturb };
-            self.bench.world.inject(fault);
-        }
-    }
-
-    fn cut_power(&mut self, cut: PowerCut) {
-        match cut {
-            PowerCut::Now => self.bench.power_off(),
-            PowerCut::Operation(operation) => {
-                self.cuts += 1;
-                let when = Cut::Torn { seed: self.cuts };
-                self.bench.machine().cut_power_at(Some(FlashCut { operation, when }));
+    fn act(&mut self, action: &Action) {
+        match *action {
+            Action::PowerOff => {
+                self.bench.power_off();
+                self.pass_us(OFF_US);
+                self.bench.machine().cut_power_at(None);
+                self.bench.power_on();
             }
+            Action::Flash(operation, Trouble::Cut(cut)) => {
+                let when = match cut {
+                    ModelCut::Before => Cut::Before,
+                    ModelCut::After => Cut::After,
+                    ModelCut::Torn(seed) => Cut::Torn { seed },
+                    ModelCut::Unstable(seed) => Cut::Unstable { seed },
+                };
+                let cut = FlashCut { operation: operation.into(), when };
+                self.bench.machine().cut_power_at(Some(cut));
+            }
+            Action::Disturb(frames) => {
+                self.bench.world.clear_faults();
+                let mine = FrameMatch { from: Some(self.bench.device.node()), ..FrameMatch::default() };
+                for n in 1..=frames {
+                    let fault =
+                        Fault { frames: mine.clone(), when: When::Nth(n), action: FaultAction::Disturb };
+                    self.bench.world.inject(fault);
+                }
+            }
+            _ => {}
         }
-    }
-
-    fn power_on(&mut self) {
-        self.bench.machine().cut_power_at(None);
-        self.bench.power_on();
     }
 
     fn set_bit_rate(&mut self, bit_rate: u32) {

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 
+use attack::device::Action;
 use canopen::Frame;
 use embedded_can::{Frame as _, Id, StandardId};
 use emulator::machine::Usart;
@@ -11,7 +12,7 @@ use emulator::time::Span;
 use shared_abi::layout::Layout;
 
 use super::board::{long_dlc, Board};
-use super::target::{Event, Happened, PowerCut, Target};
+use super::target::{Event, Happened, Target};
 use kit::random::Random;
 
 /// The device has said all that it has to say when it was silent for this time, in us: its answer to a
@@ -102,6 +103,18 @@ impl SerialBoard {
             }
         }
     }
+
+    /// Bytes that are no line, and lines that are no frame.
+    fn scramble(&mut self, random: &mut Random) {
+        // What a host could ask for is excluded by the first character: a closed channel is closed.
+        let mut bytes = vec![b'\r', b'x'];
+        let len = random.below(200);
+        let alphabet = random.pick(&[&b"tTrR0123456789ABCDEF"[..], &[0x00, 0x07, 0x0A, 0x7F, 0x80, 0xFF]]);
+        let any = random.chance(50);
+        bytes.extend((0..len).map(|_| if any { random.below(256) as u8 } else { random.pick(alphabet) }));
+        bytes[2..].iter_mut().filter(|byte| **byte == b'\r').for_each(|byte| *byte = b'!');
+        self.order(&bytes);
+    }
 }
 
 /// The text of a frame (CAN232 manual); if it has eight bytes, with any data length code that means eight.
@@ -137,10 +150,6 @@ fn frame(line: &str) -> Option<Frame> {
 }
 
 impl Target for SerialBoard {
-    fn layout(&self) -> &'static Layout {
-        self.board.layout()
-    }
-
     fn now_us(&self) -> u64 {
         self.board.now_us()
     }
@@ -188,32 +197,18 @@ impl Target for SerialBoard {
         self.board.flash_activity()
     }
 
-    /// A serial line has no error frames.
-    fn disturb(&mut self, _frames: u64) {}
-
-    fn cut_power(&mut self, cut: PowerCut) {
-        self.board.cut_power(cut);
-        if matches!(cut, PowerCut::Now) {
-            self.line.clear();
+    fn act(&mut self, action: &Action) {
+        match *action {
+            Action::Scramble(seed) => self.scramble(&mut Random(seed)),
+            // It has no error frames.
+            Action::Disturb(_) => {}
+            _ => {
+                self.board.act(action);
+                if matches!(action, Action::PowerOff) {
+                    self.line.clear();
+                }
+            }
         }
-    }
-
-    fn power_on(&mut self) {
-        self.board.power_on();
-    }
-
-    fn set_bit_rate(&mut self, _bit_rate: u32) {}
-
-    /// Bytes that are no line, and lines that are no frame.
-    fn scramble(&mut self, random: &mut Random) {
-        // What a host could ask for is excluded by the first character: a closed channel is closed.
-        let mut bytes = vec![b'\r', b'x'];
-        let len = random.below(200);
-        let alphabet = random.pick(&[&b"tTrR0123456789ABCDEF"[..], &[0x00, 0x07, 0x0A, 0x7F, 0x80, 0xFF]]);
-        let any = random.chance(50);
-        bytes.extend((0..len).map(|_| if any { random.below(256) as u8 } else { random.pick(alphabet) }));
-        bytes[2..].iter_mut().filter(|byte| **byte == b'\r').for_each(|byte| *byte = b'!');
-        self.order(&bytes);
     }
 
     fn longest_between_feeds_us(&mut self) -> u64 {

@@ -1,11 +1,12 @@
 //! What the masters send: steps of a legal master, whole or broken off, and noise between them.
 
+use attack::device::{Action, Trouble};
 use canopen::sdo::client::{Config, Download, SdoError, Step, Transfer};
 use canopen::{Address, CobId, Frame, Instant};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
+use kit::model::Cut;
 
 use super::model::{NO_NODE, RATES};
-use super::target::PowerCut;
 use super::{is_node_id, Attack, Broken};
 
 /// Objects that noise asks for.
@@ -50,13 +51,11 @@ impl Attack {
     pub(super) fn attack(&mut self) -> Result<(), Broken> {
         if self.random.chance(6) {
             let operation = self.random.pick(&[0, 1, 5, 40, 700]);
-            let cut = if self.random.chance(50) {
-                PowerCut::Operation(operation + self.random.below(9) as u64)
+            if self.random.chance(50) {
+                let operation = operation + self.random.below(9) as u32;
+                let cut = Cut::Torn(self.summary.bursts);
+                self.target.act(&Action::Flash(operation, Trouble::Cut(cut)));
             } else {
-                PowerCut::Now
-            };
-            self.target.cut_power(cut);
-            if matches!(cut, PowerCut::Now) {
                 self.was_cut = true;
                 self.pass(1000)?;
             }
@@ -65,7 +64,7 @@ impl Attack {
             let errors = self.random.pick(&[1, 10, 33, 70]);
             self.tell(format!("{errors} frames of the device are destroyed"));
             self.was_disturbed = true;
-            self.target.disturb(errors);
+            self.target.act(&Action::Disturb(errors));
         }
         for _ in 0..1 + self.random.below(6) {
             match self.random.below(16) {
@@ -482,7 +481,7 @@ impl Attack {
 
     fn noise(&mut self) -> Result<(), Broken> {
         if self.random.chance(10) {
-            self.target.scramble(&mut self.random);
+            self.target.act(&Action::Scramble(self.summary.frames));
         }
         let frame = match self.random.below(8) {
             0..=2 => self.random_frame(),

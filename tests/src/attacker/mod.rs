@@ -39,12 +39,13 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 use shared_abi::geometry::Region;
 
+use attack::device::Action;
 pub use attack::play::Broken;
 use kit::model::ModelFlash;
 use kit::random::Random;
 use model::{Ask, Model, Node, ANSWERS, NO_NODE, PARAMETERS};
 use setup::{Image, Setup};
-use target::{Happened, PowerCut, Target};
+use target::{Happened, Target};
 
 /// The longest way back from bus-off (`tests/device/hostile_bus.rs`), in us.
 const BUS_OFF_US: u64 = 5_400_000;
@@ -316,9 +317,7 @@ impl Attack {
             self.was_cut = false;
             self.was_reset = true;
             self.summary.cuts += 1;
-            self.target.cut_power(PowerCut::Now);
-            self.target.pass_us(5000);
-            self.target.power_on();
+            self.target.act(&Action::PowerOff);
             self.target.events();
             self.restarted()?;
         }
@@ -490,7 +489,7 @@ impl Attack {
 
     /// The checks after a burst.
     fn check(&mut self) -> Result<(), Broken> {
-        self.target.disturb(0);
+        self.target.act(&Action::Disturb(0));
         self.clear_doubt()?;
         if self.was_reset {
             self.pass(START_US)?;

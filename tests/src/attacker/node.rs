@@ -1,10 +1,12 @@
 //! `coboot-node` in virtual time: the firmware's `boot-core` and `canopen` without a chip, and the
 //! stand-in for a program. A frame takes its time on the bus; work on the flash takes none. It is
-//! some hundred times as fast as the emulator, and its bus has no errors.
+//! some hundred times as fast as the emulator, and its bus has no errors. Any client can use it.
 
 use std::collections::VecDeque;
 use std::env;
+use std::time::Duration;
 
+use attack::device::Action;
 use boot_core::bootloader::{self, entries, entry_count};
 use boot_core::control::Policy;
 use boot_core::flash::Flash as _;
@@ -14,14 +16,14 @@ use bsp::NODE_ID;
 use canopen::device::Device as Says;
 use canopen::od::Entry;
 use canopen::{BitRate, Frame, Instant, NodeId};
+use coboot_can::{Adapter, AdapterError};
 use coboot_node::device::{self, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::stand_in::StandIn;
 use kit::folder::Folder;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
-use shared_abi::layout::Layout;
 
-use super::target::{Event, Happened, PowerCut, Target};
+use super::target::{Event, Happened, Target, OFF_US};
 
 /// A frame with 8 bytes at 125 kbit/s, in us.
 const FRAME_US: u64 = 1000;
@@ -44,6 +46,8 @@ pub struct Node {
     steps: u64,
     /// The flash at the last look.
     cells: Vec<u8>,
+    /// What the last reset came to.
+    pub result: Option<device::Event>,
 }
 
 /// The object dictionary of a profile.
@@ -108,9 +112,17 @@ impl Node {
             events: Vec::new(),
             steps: 0,
             cells: Vec::new(),
+            result: None,
         };
         node.power_on();
         node
+    }
+
+    fn power_on(&mut self) {
+        let flash =
+            FileFlash::open(&self.folder.join("node.flash"), &LAYOUT, Speed::Instant).expect("a file");
+        let (device, event) = device::Device::new(self.setup, flash, vec![0; BUFFER].leak());
+        (self.device, self.result) = (Some(device), Some(event));
     }
 
     fn work(&mut self) {
@@ -124,6 +136,7 @@ impl Node {
             let more = device.work(now, &mut send, &mut |event| told.push(event));
             for event in told.drain(..) {
                 if !matches!(event, device::Event::NodeId(_)) {
+                    self.result = Some(event);
                     events.push((at, Happened::Reset));
                 }
             }
@@ -136,10 +149,6 @@ impl Node {
 }
 
 impl Target for Node {
-    fn layout(&self) -> &'static Layout {
-        &LAYOUT
-    }
-
     fn now_us(&self) -> u64 {
         self.now_us
     }
@@ -188,35 +197,44 @@ impl Target for Node {
         (self.steps, false)
     }
 
-    /// Its bus has no error frames.
-    fn disturb(&mut self, _frames: u64) {}
-
-    fn cut_power(&mut self, cut: PowerCut) {
-        // Its operations take no time, so that nothing can be in the middle of one.
-        if matches!(cut, PowerCut::Now) {
+    /// Its operations take no time, so that nothing can be in the middle of one; and its bus has no error frames.
+    fn act(&mut self, action: &Action) {
+        if matches!(action, Action::PowerOff) {
             // Flash does not forget. The file lags by a time of the host's clock, which would make
             // another attack of the same seed on a faster host.
             if let Some(flash) = self.device.as_mut().and_then(device::Device::flash) {
                 flash.save().expect("its file can be written");
             }
             self.device = None;
+            self.pass_us(OFF_US);
+            self.power_on();
+        }
+    }
+}
+
+impl Adapter for Node {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.waiting.push_back(*frame);
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now_us + timeout.as_micros() as u64;
+        loop {
+            let mut events = std::mem::take(&mut self.events).into_iter();
+            let sent = events.find_map(|(_, happened)| match happened {
+                Happened::Frame { by_device: true, frame } => Some(frame),
+                _ => None,
+            });
+            self.events = events.collect();
+            if sent.is_some() || self.now_us >= until {
+                return Ok(sent);
+            }
+            self.pass_us(FRAME_US / 2);
         }
     }
 
-    fn power_on(&mut self) {
-        if self.device.is_some() {
-            return;
-        }
-        let flash =
-            FileFlash::open(&self.folder.join("node.flash"), &LAYOUT, Speed::Instant).expect("a file");
-        let (device, _) = device::Device::new(self.setup, flash, vec![0; BUFFER].leak());
-        self.device = Some(device);
-    }
-
-    /// Its bus has no bit rate.
-    fn set_bit_rate(&mut self, _bit_rate: u32) {}
-
-    fn complaint(&mut self) -> Option<String> {
-        None
+    fn now(&self) -> Duration {
+        Duration::from_micros(self.now_us)
     }
 }

@@ -1,9 +1,7 @@
 //! What an attacker sees of a device: its bus, its power and its flash.
 
+use attack::device::Action;
 use canopen::Frame;
-use shared_abi::layout::Layout;
-
-use kit::random::Random;
 
 /// Something that happened on the device or on its bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,14 +28,8 @@ pub enum Happened {
 /// A point of time of the device's virtual time, in us, and what happened then.
 pub type Event = (u64, Happened);
 
-/// A power cut.
-#[derive(Clone, Copy, Debug)]
-pub enum PowerCut {
-    /// Now.
-    Now,
-    /// In the middle of the flash operation with this number from now on, counted from 0.
-    Operation(u64),
-}
+/// The time without power, in us.
+pub const OFF_US: u64 = 5000;
 
 /// The longest time from a request to its answer in virtual time, in us: the request, the answer, a
 /// heartbeat and some emergencies of 1.1 ms each at 125 kbit/s, and two ticks of the device.
@@ -45,17 +37,9 @@ pub const ANSWER_US: u64 = 15_000;
 
 /// A device in virtual time, on a bus with two masters.
 pub trait Target {
-    /// The memory layout of the device.
-    fn layout(&self) -> &'static Layout;
-
     /// The longest time from a request to its answer, in us.
     fn answer_us(&self) -> u64 {
         ANSWER_US
-    }
-
-    /// Noise below the level of frames, where there is one.
-    fn scramble(&mut self, random: &mut Random) {
-        let _ = random;
     }
 
     /// Virtual time in us.
@@ -79,17 +63,14 @@ pub trait Target {
     /// A number that grows with each flash operation, and whether one runs.
     fn flash_activity(&mut self) -> (u64, bool);
 
-    /// Destroys this many frames of the device from now on, 0 for none.
-    fn disturb(&mut self, frames: u64);
+    /// Carries out an action below the frames, if it can: a power cut now or in the middle of a flash operation,
+    /// errors on the bus, bytes on a line that are no frame. (What masters send is frames.)
+    fn act(&mut self, action: &Action);
 
-    /// Orders a power cut.
-    fn cut_power(&mut self, cut: PowerCut);
-
-    /// Switches the power on again, and takes back a cut that has not happened.
-    fn power_on(&mut self);
-
-    /// The masters change to this bit rate, in bit/s.
-    fn set_bit_rate(&mut self, bit_rate: u32);
+    /// The masters change to this bit rate, in bit/s, on a bus that has one.
+    fn set_bit_rate(&mut self, bit_rate: u32) {
+        let _ = bit_rate;
+    }
 
     /// The longest time between two feeds of its watchdog so far, in us; 0 without a watchdog.
     fn longest_between_feeds_us(&mut self) -> u64 {
@@ -97,5 +78,7 @@ pub trait Target {
     }
 
     /// What the device did that it must not do and no rule names; `None` for nothing.
-    fn complaint(&mut self) -> Option<String>;
+    fn complaint(&mut self) -> Option<String> {
+        None
+    }
 }

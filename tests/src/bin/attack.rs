@@ -11,6 +11,7 @@ use std::time::Instant;
 use coboot_tests::attacker::setup::Setup;
 use coboot_tests::attacker::{run, Found, Summary};
 use coboot_tests::silicon;
+use serde_json::{json, Value};
 
 /// The frames of an attack on one board, and many times as many on a node; then a new one is attacked
 /// with the next seed.
@@ -45,10 +46,8 @@ fn options() -> Result<Options, String> {
     Ok(options)
 }
 
-/// What is left to attack, and what came of it.
+/// What came of the attacks.
 struct Work {
-    /// The number of the next attack.
-    next: u64,
     rows: Vec<Row>,
     found: Vec<Found>,
 }
@@ -76,35 +75,21 @@ fn main() -> ExitCode {
     let frames = options.frames.div_ceil(attacks).max(1);
     let rows =
         setups.iter().map(|setup| Row { name: setup.name, seeds: Vec::new(), summary: Summary::default() });
-    let work = Mutex::new(Work { next: 0, rows: rows.collect(), found: Vec::new() });
-    let threads = thread::available_parallelism().map_or(1, usize::from);
-    thread::scope(|scope| {
-        for _ in 0..threads {
-            scope.spawn(|| loop {
-                let n = {
-                    let mut work = work.lock().expect("no attack panics");
-                    let n = work.next;
-                    if n >= attacks {
-                        return;
-                    }
-                    work.next += 1;
-                    n
-                };
-                // Each setup gets each seed in turn.
-                let (at, seed) = (n as usize % setups.len(), options.seed + n / setups.len() as u64);
-                let result = run(&setups[at], seed, frames * setups[at].pace());
-                let mut work = work.lock().expect("no attack panics");
-                match result {
-                    Ok(summary) => {
-                        work.rows[at].seeds.push(seed);
-                        work.rows[at].summary.add(&summary);
-                    }
-                    Err(found) => {
-                        println!("{found}");
-                        work.found.push(*found);
-                    }
-                }
-            });
+    let work = Mutex::new(Work { rows: rows.collect(), found: Vec::new() });
+    on_all_cores(attacks, |n| {
+        // Each setup gets each seed in turn.
+        let (at, seed) = (n as usize % setups.len(), options.seed + n / setups.len() as u64);
+        let result = run(&setups[at], seed, frames * setups[at].pace());
+        let mut work = work.lock().expect("no attack panics");
+        match result {
+            Ok(summary) => {
+                work.rows[at].seeds.push(seed);
+                work.rows[at].summary.add(&summary);
+            }
+            Err(found) => {
+                println!("{found}");
+                work.found.push(*found);
+            }
         }
     });
     let work = work.into_inner().expect("no attack panics");
@@ -124,12 +109,34 @@ fn main() -> ExitCode {
         all
     });
     println!("\n{} frames, {} bursts, {} rules broken.", all.frames, all.bursts, work.found.len());
+    ended(&options, as_json(&work, &all), work.found.is_empty())
+}
+
+/// Does this for each number below `count`, on all cores; so many they are.
+fn on_all_cores(count: u64, play: impl Fn(u64) + Sync) -> usize {
+    let next = AtomicU64::new(0);
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| loop {
+                match next.fetch_add(1, Ordering::Relaxed) {
+                    n if n < count => play(n),
+                    _ => return,
+                }
+            });
+        }
+    });
+    threads
+}
+
+/// Writes the facts, if they are wanted.
+fn ended(options: &Options, facts: Value, is_good: bool) -> ExitCode {
     if let Some(path) = &options.evidence {
-        if let Err(error) = std::fs::write(path, as_json(&work, &all)) {
+        if let Err(error) = std::fs::write(path, format!("{facts}\n")) {
             return refuse(&format!("{path}: {error}"));
         }
     }
-    if work.found.is_empty() {
+    if is_good {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
@@ -139,21 +146,12 @@ fn main() -> ExitCode {
 /// Plays the scenarios with so many seeds, the first one given, on all cores. A failure was printed by its
 /// panic; here is which seeds failed.
 fn play_silicon(options: &Options, count: u64) -> ExitCode {
-    let (next, failed) = (AtomicU64::new(0), Mutex::new(Vec::new()));
+    let failed = Mutex::new(Vec::new());
     let began = Instant::now();
-    let threads = thread::available_parallelism().map_or(1, usize::from);
-    thread::scope(|scope| {
-        for _ in 0..threads {
-            scope.spawn(|| loop {
-                let n = next.fetch_add(1, Ordering::Relaxed);
-                if n >= count {
-                    return;
-                }
-                let seed = options.seed.wrapping_add(n);
-                if catch_unwind(|| silicon::play(seed)).is_err() {
-                    failed.lock().expect("pushing does not panic").push(seed);
-                }
-            });
+    let threads = on_all_cores(count, |n| {
+        let seed = options.seed.wrapping_add(n);
+        if catch_unwind(|| silicon::play(seed)).is_err() {
+            failed.lock().expect("pushing does not panic").push(seed);
         }
     });
     let mut failed = failed.into_inner().expect("pushing does not panic");
@@ -163,17 +161,8 @@ fn play_silicon(options: &Options, count: u64) -> ExitCode {
     for seed in &failed {
         println!("{seed} failed: see it again with --silicon 1 --seed {seed}");
     }
-    if let Some(path) = &options.evidence {
-        let facts = format!("{{\"chips\": {count}, \"failed\": {}, \"seeds\": {failed:?}}}\n", failed.len());
-        if let Err(error) = std::fs::write(path, facts) {
-            return refuse(&format!("{path}: {error}"));
-        }
-    }
-    if failed.is_empty() {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    }
+    let facts = json!({ "chips": count, "failed": failed.len(), "seeds": failed });
+    ended(options, facts, failed.is_empty())
 }
 
 fn refuse(why: &str) -> ExitCode {
@@ -181,47 +170,35 @@ fn refuse(why: &str) -> ExitCode {
     ExitCode::FAILURE
 }
 
-fn counts(summary: &Summary) -> String {
-    format!(
-        "\"frames\": {}, \"bursts\": {}, \"answers\": {}, \"errors\": {}, \"resets\": {}, \"power_cuts\": {}, \"updates\": {}, \"stores\": {}, \"slowest_answer_ms\": {:.1}, \"slowest_answer_behind_bus_off_ms\": {:.1}, \"longest_between_feeds_ms\": {:.1}",
-        summary.frames,
-        summary.bursts,
-        summary.answers,
-        summary.errors,
-        summary.resets,
-        summary.cuts,
-        summary.updates,
-        summary.stores,
-        summary.slowest_us as f64 / 1e3,
-        summary.slowest_off_us as f64 / 1e3,
-        summary.unfed_us as f64 / 1e3
-    )
+/// The counts, with these facts more.
+fn counts(summary: &Summary, more: Value) -> Value {
+    let ms = |us: u64| (us as f64 / 100.0).round() / 10.0;
+    let mut counts = json!({
+        "frames": summary.frames,
+        "bursts": summary.bursts,
+        "answers": summary.answers,
+        "errors": summary.errors,
+        "resets": summary.resets,
+        "power_cuts": summary.cuts,
+        "updates": summary.updates,
+        "stores": summary.stores,
+        "slowest_answer_ms": ms(summary.slowest_us),
+        "slowest_answer_behind_bus_off_ms": ms(summary.slowest_off_us),
+        "longest_between_feeds_ms": ms(summary.unfed_us),
+    });
+    if let (Value::Object(counts), Value::Object(more)) = (&mut counts, more) {
+        counts.extend(more);
+    }
+    counts
 }
 
-fn as_json(work: &Work, all: &Summary) -> String {
-    let rows: Vec<String> = work
-        .rows
-        .iter()
-        .map(|row| {
-            format!("  {{\"setup\": {:?}, \"seeds\": {:?}, {}}}", row.name, row.seeds, counts(&row.summary))
-        })
-        .collect();
-    let found: Vec<String> = work
-        .found
-        .iter()
-        .map(|found| {
-            let what = found.broken.to_string();
-            format!(
-                "  {{\"setup\": {:?}, \"seed\": {}, \"burst\": {}, \"what\": {what:?}}}",
-                found.setup, found.seed, found.burst
-            )
-        })
-        .collect();
-    format!(
-        "{{{}, \"failed\": {}, \"setups\": [\n{}\n], \"found\": [\n{}\n]}}\n",
-        counts(all),
-        found.len(),
-        rows.join(",\n"),
-        found.join(",\n")
-    )
+fn as_json(work: &Work, all: &Summary) -> Value {
+    let row = |row: &Row| counts(&row.summary, json!({ "setup": row.name, "seeds": row.seeds }));
+    let found = |found: &Found| {
+        let what = found.broken.to_string();
+        json!({ "setup": found.setup, "seed": found.seed, "burst": found.burst, "what": what })
+    };
+    let rows: Vec<_> = work.rows.iter().map(row).collect();
+    let all_found: Vec<_> = work.found.iter().map(found).collect();
+    counts(all, json!({ "failed": all_found.len(), "setups": rows, "found": all_found }))
 }

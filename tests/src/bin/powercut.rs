@@ -1,10 +1,12 @@
 //! `cargo xtask powercut`: cuts the power at every flash operation, and checks the device after the
 //! power returns.
 
+use std::collections::BTreeMap;
 use std::process::ExitCode;
 
 use attack::cuts::{self, Cuts, Point, Report};
 use coboot_tests::powercut::{self, Effort};
+use serde_json::{json, Value};
 
 /// What to do.
 #[derive(Default)]
@@ -57,7 +59,7 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
 /// The counts of all scenarios.
 #[derive(Default)]
 struct Sum {
-    rows: Vec<String>,
+    rows: Vec<Value>,
     points: u64,
     states: u64,
     violations: u64,
@@ -122,13 +124,10 @@ fn main() -> ExitCode {
     if rows.is_empty() {
         return refuse("there is no such scenario; docs/powercut.md names them.");
     }
-    let object = format!(
-        "{{\"board\": \"{}\", \"points\": {points}, \"states\": {states}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
-        coboot_tests::firmware::board().board,
-        rows.join(",\n")
-    );
+    let board = coboot_tests::firmware::board().board;
+    let object = json!({ "board": board, "points": points, "states": states, "violations": violations, "scenarios": rows });
     if let Some(file) = &wish.evidence {
-        if let Err(error) = std::fs::write(file, &object) {
+        if let Err(error) = std::fs::write(file, object.to_string()) {
             return refuse(&format!("{file} cannot be written: {error}"));
         }
     }
@@ -166,21 +165,22 @@ fn as_text(name: &str, report: &Report) -> String {
     text
 }
 
-fn as_json(level: u8, name: &str, report: &Report) -> String {
+fn as_json(level: u8, name: &str, report: &Report) -> Value {
     let [bootloader, old, new] = outcomes(report);
-    let told: Vec<_> =
-        report.told.iter().map(|(point, what)| format!("{:?}", format!("{point}: {what}"))).collect();
-    let row =
-        |(way, letters): (&&str, &Vec<u8>)| format!("\"{way}\": \"{}\"", String::from_utf8_lossy(letters));
-    let map: Vec<_> = report.map.iter().map(row).collect();
-    format!(
-        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"states\": {}, \"recoveries\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}], \"map\": {{{}}}}}",
-        report.operations,
-        report.points,
-        report.states,
-        report.recoveries,
-        report.violations,
-        told.join(", "),
-        map.join(", ")
-    )
+    let told: Vec<_> = report.told.iter().map(|(point, what)| format!("{point}: {what}")).collect();
+    let map = report.map.iter().map(|(way, letters)| (*way, String::from_utf8_lossy(letters)));
+    json!({
+        "level": level,
+        "scenario": name,
+        "operations": report.operations,
+        "points": report.points,
+        "states": report.states,
+        "recoveries": report.recoveries,
+        "bootloader": bootloader,
+        "old_program": old,
+        "new_program": new,
+        "violations": report.violations,
+        "told": told,
+        "map": map.collect::<BTreeMap<_, _>>(),
+    })
 }
