@@ -95,7 +95,7 @@ fn a_newer_genuine_bootloader_is_installed_and_an_older_one_never() {
     power_cycle(&mut bench);
     assert_eq!((running(&mut bench), progress(&mut bench).state), (0x0002_0000, State::Installed));
     // Not older, not another one with the same counter; and the same again changes nothing.
-    let spare = cells(&mut bench, staging);
+    let spare = cells(&bench, staging);
     for (file, expected) in [
         (sealed(1, 0x0003_0000), status::ROLLBACK),
         (sealed(2, 0x0003_0000), status::ROLLBACK),
@@ -103,7 +103,7 @@ fn a_newer_genuine_bootloader_is_installed_and_an_older_one_never() {
     ] {
         assert_eq!(send(&mut bench, &file), expected);
         assert_eq!(progress(&mut bench).state, State::Installed);
-        assert_eq!(cells(&mut bench, staging), spare);
+        assert_eq!(cells(&bench, staging), spare);
     }
     bench.machine().keep_flash_log();
     assert_eq!(send(&mut bench, &second), status::OK);
@@ -146,13 +146,13 @@ fn the_image_at_home_sent_again_gives_up_the_one_in_staging() {
     let (second, third) = (sealed(2, 0x0002_0000), sealed(3, 0x0003_0000));
     let mut bench = device_with_staged(&second, &third);
     let staging = Region::new(firmware::board().staging.unwrap().base, 1024);
-    let before = cells(&mut bench, staging);
+    let before = cells(&bench, staging);
     assert_ne!(identification(&mut bench), crc_of(&image(2, 0x0002_0000)));
     // The staged one again keeps it.
     assert_eq!(send(&mut bench, &third), status::OK);
     assert_eq!(progress(&mut bench).state, State::Staged);
     assert_eq!(send(&mut bench, &second), status::OK);
-    assert_eq!((progress(&mut bench).state, cells(&mut bench, staging)), (State::None, before));
+    assert_eq!((progress(&mut bench).state, cells(&bench, staging)), (State::None, before));
     assert_eq!(identification(&mut bench), crc_of(&image(2, 0x0002_0000)));
     bench.session().command(number(), ProgramControl::Start).unwrap();
     bench.run_ms(500);
@@ -189,9 +189,9 @@ fn an_image_that_is_not_genuine_is_refused() {
         ("signed as a program", signed_as_program, status::SIGNATURE),
         ("altered", altered, status::SIGNATURE),
     ] {
-        let before = cells(&mut bench, staging);
+        let before = cells(&bench, staging);
         assert_eq!(send(&mut bench, &file), expected, "{case}");
-        assert_eq!(cells(&mut bench, staging), before, "{case}");
+        assert_eq!(cells(&bench, staging), before, "{case}");
         assert_eq!(progress(&mut bench).state, State::None, "{case}");
         assert_eq!(identification(&mut bench), old, "{case}");
         // After a bad signature the device waits.

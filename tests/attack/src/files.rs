@@ -16,7 +16,8 @@ use crate::sealed::{certificate, keys, sealer, Parts};
 /// What a download contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Content {
-    /// The RAM image of a bootloader: 0 to 3 and 6 may run here, 4 is damaged, and 5 is for another board.
+    /// The RAM image of a bootloader: 0 to 3 and 6 may run here, 4 is damaged, and 5 is for another
+    /// board.
     Image(u8),
     /// A program with this number, for its place.
     Program(u8, Extent),

@@ -352,7 +352,7 @@ pub struct Stored {
     pub node: NodeParameters,
 }
 
-/// A bootloader with the memory that it borrows: a device that makes many resets takes no more than one.
+/// A bootloader with the memory that it borrows: a device that makes many resets has one at a time.
 pub struct Owned {
     /// It is dropped before its memory.
     node: ManuallyDrop<Box<dyn Node>>,
@@ -361,8 +361,8 @@ pub struct Owned {
 
 #[allow(unsafe_code, reason = "a bootloader and what it borrows are kept together")]
 impl Owned {
-    /// The bootloader that `boot` makes with a buffer of this size and, if `is_sealed`, with the memory for sealed
-    /// images.
+    /// The bootloader that `boot` makes with a buffer of this size and, if `is_sealed`, with the
+    /// memory for sealed images.
     pub fn new(
         buffer: usize,
         is_sealed: bool,
@@ -381,8 +381,8 @@ impl Drop for Owned {
     fn drop(&mut self) {
         // SAFETY: `node` is not used after this.
         unsafe { ManuallyDrop::drop(&mut self.node) };
-        // SAFETY: it came from a box, and `node` had the only references to it: `boot`, which is good for any
-        // lifetime, cannot have kept one.
+        // SAFETY: it came from a box, and `node` had the only references to it: `boot`, which is
+        // good for any lifetime, cannot have kept one.
         drop(unsafe { Box::from_raw(self.memory.as_ptr()) });
     }
 }

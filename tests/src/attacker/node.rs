@@ -197,7 +197,8 @@ impl Target for Node {
         (self.steps, false)
     }
 
-    /// Its operations take no time, so that nothing can be in the middle of one; and its bus has no error frames.
+    /// Its operations take no time, so that nothing can be in the middle of one; and its bus has no
+    /// error frames.
     fn act(&mut self, action: &Action) {
         if matches!(action, Action::PowerOff) {
             // Flash does not forget. The file lags by a time of the host's clock, which would make

@@ -63,8 +63,8 @@ pub trait Target {
     /// A number that grows with each flash operation, and whether one runs.
     fn flash_activity(&mut self) -> (u64, bool);
 
-    /// Carries out an action below the frames, if it can: a power cut now or in the middle of a flash operation,
-    /// errors on the bus, bytes on a line that are no frame. (What masters send is frames.)
+    /// Carries out an action below the frames, if it can: a power cut now or in the middle of a
+    /// flash operation, errors on the bus, bytes on a line that are no frame. (Masters send frames.)
     fn act(&mut self, action: &Action);
 
     /// The masters change to this bit rate, in bit/s, on a bus that has one.
