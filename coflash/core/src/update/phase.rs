@@ -8,7 +8,8 @@ use serde::Serialize;
 
 use crate::advice::Advice;
 use crate::device::info::Nameplate;
-use crate::device::{DeviceType, Dialect, Doing};
+use crate::device::session::Silence;
+use crate::device::{DeviceType, Dialect};
 use crate::file::checksum::Checksum;
 use crate::file::Target;
 use crate::json;
@@ -172,17 +173,7 @@ pub enum Warning {
         why: String,
     },
     /// The device has not answered for a while, and the tool waits for it.
-    Silent {
-        /// The action that it was asked to do.
-        #[serde(serialize_with = "json::words")]
-        doing: Doing,
-        /// How long it has been silent.
-        #[serde(rename = "seconds", serialize_with = "json::seconds")]
-        silent: Duration,
-        /// How long the tool waits in total.
-        #[serde(rename = "limit_seconds", serialize_with = "json::seconds")]
-        limit: Duration,
-    },
+    Silent(Silence),
 }
 
 impl fmt::Display for Phase {
@@ -277,12 +268,7 @@ impl fmt::Display for Warning {
             Self::BeginsAgain { why } => {
                 write!(f, "what the device had of this program is not usable ({why}): sending everything")
             }
-            Self::Silent { doing, silent, limit } => write!(
-                f,
-                "no answer for {:.0} s ({doing}), waiting up to {:.0} s",
-                silent.as_secs_f64(),
-                limit.as_secs_f64()
-            ),
+            Self::Silent(silence) => silence.fmt(f),
         }
     }
 }

@@ -9,7 +9,6 @@ use super::event::{Event, Note, Phase, Warning};
 use super::options::FlashOptions;
 use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
-use crate::device::session::Silence;
 use crate::device::{Dialect, Session};
 
 /// Carries out `work` in a session that reports silence of the node as an event.
@@ -19,10 +18,7 @@ pub(super) fn reporting_silence<R>(
     work: impl FnOnce(&mut Session<'_>, &mut dyn FnMut(Event)) -> R,
 ) -> R {
     let on_event = RefCell::new(on_event);
-    let silence = |silence: Silence| {
-        let Silence { doing, silent, limit, .. } = silence;
-        (on_event.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
-    };
+    let silence = |silence| (on_event.borrow_mut())(Warning::Silent(silence).into());
     let mut on_event = |event| (on_event.borrow_mut())(event);
     let (node, timing) = (session.node(), *session.timing());
     work(&mut session.with(node, timing).report_silence(&silence), &mut on_event)

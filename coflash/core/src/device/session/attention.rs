@@ -41,7 +41,7 @@ impl<'a> Session<'a> {
         if silent < SILENCE || silent >= limit || std::mem::replace(&mut self.watch().reported, true) {
             return;
         }
-        hook(Silence { node: self.node, doing, silent, limit });
+        hook(Silence { doing, silent, limit });
     }
 
     /// Checks whether another tool is using the node: listens for a moment, in which the time counts

@@ -1,6 +1,7 @@
 //! What a session observes besides its transfers: how long its node has been silent, and whether
 //! another tool talks to the node.
 
+use std::fmt;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,10 +10,12 @@ use canopen::emcy::code;
 use canopen::nmt::parse_boot_up;
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
+use serde::Serialize;
 
 use crate::device::doing::Doing;
 use crate::device::error::{Error, Intruder};
 use crate::device::listen::listen;
+use crate::json;
 use coboot_can::echo::Echoes;
 use coboot_can::Adapter;
 
@@ -25,17 +28,26 @@ pub const SILENCE: Duration = Duration::from_secs(2);
 /// block download.
 const OWN_MAX: usize = 256;
 
-/// A node that has not answered for a while, while the session waits for it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// The node has not answered for a while, and the session waits for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Silence {
-    /// The node.
-    pub node: NodeId,
     /// The action that it was asked to do.
+    #[serde(serialize_with = "json::words")]
     pub doing: Doing,
     /// How long it has been silent.
+    #[serde(rename = "seconds", serialize_with = "json::seconds")]
     pub silent: Duration,
     /// How long the session waits in total.
+    #[serde(rename = "limit_seconds", serialize_with = "json::seconds")]
     pub limit: Duration,
+}
+
+impl fmt::Display for Silence {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { doing, silent, limit } = self;
+        let [silent, limit] = [silent, limit].map(Duration::as_secs_f64);
+        write!(f, "no answer for {silent:.0} s ({doing}), waiting up to {limit:.0} s")
+    }
 }
 
 /// The observations so far.

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use super::{file, node};
 use canopen::{AbortCode, NodeId};
-use coflash_core::device::{DeviceType, Dialect, Session, Timing};
+use coflash_core::device::session::Silence;
+use coflash_core::device::{DeviceType, Dialect, Doing, Session, Timing};
 use coflash_core::file::checksum::Checksum;
 use coflash_core::file::Target;
 use coflash_core::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
@@ -157,6 +158,12 @@ fn the_names_stay() {
         ("note", "master_back", Note::MasterBack { node: of(3) }.into(), json!({ "master": 3 })),
         ("warning", "master_kept", Warning::MasterKept { node: of(3) }.into(), json!({ "master": 3 })),
         ("warning", "master_missing", Warning::MasterMissing.into(), json!({})),
+        (
+            "warning",
+            "silent",
+            Warning::Silent(Silence { doing: Doing::Restart, silent: seconds, limit: seconds }).into(),
+            json!({ "doing": "restarting the program", "seconds": 1.235, "limit_seconds": 1.235 }),
+        ),
     ];
     for (kind, name, event, data) in cases {
         let mut form = json!({ "event": kind });
