@@ -6,7 +6,6 @@
 use std::fmt::{self, Display};
 
 use canopen::NodeId;
-use coboot_can::AdapterError;
 
 /// Who says the advice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -68,17 +67,6 @@ fn of_front(sentence: &str, front: Front) -> String {
 impl Display for Advice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.words(Front::Terminal))
-    }
-}
-
-impl From<&AdapterError> for Advice {
-    fn from(error: &AdapterError) -> Self {
-        let words = error.advice();
-        match error {
-            AdapterError::Url { .. } => Self::Url { words },
-            error if error.is_absent() => Self::NoAdapter { words },
-            _ => Self::Adapter { words },
-        }
     }
 }
 

@@ -8,6 +8,7 @@ mod comparison;
 pub mod config;
 mod device_after;
 pub mod dialect;
+mod entry;
 pub mod event;
 mod history;
 mod judge;

@@ -7,11 +7,12 @@
 use super::admission::admit;
 use super::aftermath::state_after;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
-use super::dialect::{self, Downloaded};
+use super::dialect::Downloaded;
+use super::entry::{self, enter};
 use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
 use super::payload::Payload;
-use super::reach::{enter, find, reach};
+use super::reach::{find, reach};
 use super::report::Renewal;
 use super::running::{give_back, reporting_silence, RunningUpdate};
 use super::steps::compare_crc;
@@ -71,7 +72,7 @@ fn procedure(
         enter(session, file, found, admission, update)
     })?;
     let (dialect, options) = (update.dialect, update.options);
-    let procedure = dialect::procedure(file, dialect);
+    let procedure = entry::procedure(file, dialect);
     if dialect != Dialect::Block {
         session.leave_group();
     }

@@ -3,6 +3,7 @@
 use canopen::debugger::DEBUGGER;
 use canopen::program::{FlashError, ACCESS, EVENTS};
 use canopen::{AbortCode, NodeId};
+use coboot_can::AdapterError;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
@@ -176,5 +177,16 @@ fn any_refusal_advice(code: AbortCode) -> Advice {
         AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY => Advice::SmallerBlocks,
         AbortCode::TIMEOUT | AbortCode::TOGGLE | AbortCode::COMMAND => Advice::LostFrames,
         _ => Advice::Refused,
+    }
+}
+
+impl From<&AdapterError> for Advice {
+    fn from(error: &AdapterError) -> Self {
+        let words = error.advice();
+        match error {
+            AdapterError::Url { .. } => Self::Url { words },
+            error if error.is_absent() => Self::NoAdapter { words },
+            _ => Self::Adapter { words },
+        }
     }
 }

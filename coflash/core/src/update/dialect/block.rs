@@ -7,8 +7,8 @@ use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address};
 use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
-use super::procedure::{Downloaded, Procedure};
-use super::whole;
+use super::procedure::{self, Downloaded, Procedure};
+
 use crate::advice::Advice;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
@@ -55,11 +55,11 @@ impl Procedure for Block {
         }
         let (file, is_sealed) = match file {
             Payload::Program(program) => (BlockFile::of(program), false),
-            Payload::Bootloader(_) => return whole::download(self, session, file, update),
+            Payload::Bootloader(_) => return procedure::download(self, session, file, update),
             Payload::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
-                    None => return whole::download(self, session, file, update),
+                    None => return procedure::download(self, session, file, update),
                     Some(size) => size,
                 };
                 (cut_up(session, sealed, size, number)?, true)

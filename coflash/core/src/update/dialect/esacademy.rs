@@ -5,8 +5,7 @@ use std::time::Duration;
 use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
-use super::procedure::Procedure;
-use super::whole::idle;
+use super::procedure::{idle, Procedure};
 use crate::device::error::{absent, reported};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::event::Note;

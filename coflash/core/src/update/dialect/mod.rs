@@ -14,7 +14,6 @@
 //! its lines in this file.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
-use super::payload::Payload;
 use crate::device::Dialect;
 
 mod block;
@@ -22,8 +21,7 @@ mod cia302;
 mod esacademy;
 mod lift;
 mod procedure;
-mod renew;
-mod whole;
+pub(super) mod renew;
 
 pub use self::esacademy::PASSWORD as ESACADEMY_PASSWORD;
 pub use self::lift::read_locked;
@@ -44,14 +42,5 @@ pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
         Dialect::Hex => &cia302::Cia302(Dialect::Hex),
         Dialect::Lift => &lift::Lift,
         Dialect::EsAcademy => &esacademy::EsAcademy,
-    }
-}
-
-/// The procedure for this payload in this dialect.
-pub(super) fn procedure(file: &Payload, dialect: Dialect) -> &'static dyn Procedure {
-    if file.is_bootloader() {
-        &renew::Renew
-    } else {
-        of(dialect)
     }
 }

@@ -7,8 +7,7 @@ use canopen::program::ProgramControl;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 use super::of;
-use super::procedure::{call_back, Downloaded, Procedure};
-use super::whole;
+use super::procedure::{self, call_back, Downloaded, Procedure};
 use crate::device::access::takes_open;
 use crate::device::error::reported;
 use crate::device::renewal::{bootloader, progress, Bootloader};
@@ -31,7 +30,7 @@ const LEAVES_WITHIN: Duration = Duration::from_millis(200);
 const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(75);
 
 /// See the [module](self).
-pub(super) struct Renew;
+pub(in crate::update) struct Renew;
 
 impl Procedure for Renew {
     /// A lift gets its password for that, and the tool the NMT mastership.
@@ -84,7 +83,7 @@ impl Procedure for Renew {
     }
 
     fn status(&self, session: &mut Session<'_>, number: u8, doing: Doing) -> Result<DownloadStatus, Error> {
-        whole::idle(session, number, doing)
+        procedure::idle(session, number, doing)
     }
 }
 
@@ -113,7 +112,7 @@ fn renew(
         leave_trial(session, number, running, update)?;
         let began = session.now();
         let content = file.encoded(Form::Image);
-        repeats = whole::send(&Renew, session, number, &content, Doing::Bootloader, update)?;
+        repeats = procedure::send(&Renew, session, number, &content, Doing::Bootloader, update)?;
         transfer = session.now().saturating_sub(began);
         if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
             // The device has found the same image.
