@@ -3,7 +3,7 @@
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::{Address, BitRate};
-use coboot_tests::bench::Bench;
+use coboot_tests::bench::{Bench, NODE as BOARD_NODE};
 use coboot_tests::{firmware, renewal};
 use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
@@ -153,7 +153,7 @@ fn a_product_without_the_choice_keeps_the_identity_of_the_board() {
     let numbers = |bench: &mut Bench| [1, 2, 3, 4].map(|sub| bench.number(0x1018, sub));
     assert_eq!(numbers(&mut bench), of_board());
     bench.update(firmware::APP_V1);
-    assert!(!bench.is_bootloader(NODE));
+    assert!(!bench.is_bootloader(BOARD_NODE));
     assert_eq!(numbers(&mut bench), of_board());
 }
 

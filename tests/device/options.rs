@@ -5,7 +5,7 @@
 use canopen::program::ProgramControl;
 use canopen::{BitRate, NodeId};
 use coboot_can::SdoIds;
-use coboot_tests::bench::Bench;
+use coboot_tests::bench::{Bench, NODE as BOARD_NODE};
 use coboot_tests::firmware;
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::update::{flash, FlashOptions};
@@ -111,7 +111,7 @@ fn block_download_has_the_products_sub_blocks_or_is_not_there() {
     let refused = bench.ask(0x601, &initiate, 0x581).unwrap();
     assert_eq!((refused[0], refused[4..].to_vec()), (0x80, vec![0x01, 0, 0x04, 0x05]));
     bench.update(firmware::APP_V1);
-    assert!(!bench.is_bootloader(NODE));
+    assert!(!bench.is_bootloader(BOARD_NODE));
 }
 
 /// A program gets the COB-IDs with the handoff: trial, start and call back go by the same ones.
