@@ -84,7 +84,7 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     let old = image_of(firmware::BOOTLOADER);
     assert_eq!((progress(&mut bench), identification(&mut bench)), (Progress::default(), crc_of(&old)));
     let program = Region::new(firmware::board().programs[0].base, 32 * 1024);
-    let before = cells(&mut bench, program);
+    let before = cells(&bench, program);
     bench.power_off();
     let starts = bench.power_on_to_first_instruction();
     bench.await_program(1000);
@@ -92,7 +92,7 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
 
     let new = version(firmware::BOOTLOADER, NEW);
     stage(&mut bench, &new);
-    assert_eq!(cells(&mut bench, home(old.len())), old, "home is untouched");
+    assert_eq!(cells(&bench, home(old.len())), old, "home is untouched");
     let silence = start(&mut bench);
     assert!(silence <= Span::from_millis(25), "{silence:?}");
     let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
@@ -104,7 +104,7 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     let answers = bench.frames_of(RESPONSE, from);
     let slowest = asked.zip(answers).map(|((asked, _), (answered, _))| answered - asked).max().unwrap();
     assert!(slowest <= Span::from_millis(5), "{slowest:?}");
-    assert_eq!(cells(&mut bench, home(new.len())), new);
+    assert_eq!(cells(&bench, home(new.len())), new);
 
     // Programs start as before, and the new image is the bootloader.
     bench.events();
@@ -113,7 +113,7 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     let later = bench.power_on_to_first_instruction().0 - starts.0;
     assert!(later <= Span::from_micros(200).0, "{later}");
     bench.await_program(1000);
-    assert_eq!(cells(&mut bench, program), before);
+    assert_eq!(cells(&bench, program), before);
     call_back(&mut bench);
     let installed = Progress { state: State::Installed, ..Progress::default() };
     assert_eq!((progress(&mut bench), identification(&mut bench)), (installed, crc_of(&new)));
@@ -136,7 +136,7 @@ fn the_watchdog_of_the_option_bytes_bites_in_no_step_of_a_renewal() {
     confirm(&mut bench);
     bench.run_ms(1000);
     assert_eq!(bench.events(), []);
-    assert_eq!(cells(&mut bench, home(new.len())), new);
+    assert_eq!(cells(&bench, home(new.len())), new);
     assert_eq!(progress(&mut bench).state, State::Installed);
     bench.assert_nothing_unmodelled();
 }
@@ -170,7 +170,7 @@ fn an_nmt_reset_waits_for_an_installation() {
         bench.post(0x000, &[0x81, NODE]);
         bench.run_ms(100);
     }
-    assert_eq!(cells(&mut bench, home(new.len())), new);
+    assert_eq!(cells(&bench, home(new.len())), new);
     let sector = firmware::board().chip.sector_at(home(1).base).unwrap();
     let log = bench.machine().take_flash_log();
     let erases = |operation: &&Operation| matches!(operation, Operation::Erase { sectors } if sectors.contains(&sector));
@@ -240,7 +240,7 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
         let _ = bench.session().command(number(), ProgramControl::SetSignature);
         bench.run_ms(3_000);
         bench.machine().cut_power_at(None);
-        let left = cells(&mut bench, home(new.len()));
+        let left = cells(&bench, home(new.len()));
         assert!(left != new, "the cut came too late");
         lacks_header |= left[4..8] == [0xFF; 4];
         power_cycle(&mut bench);
@@ -254,7 +254,7 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
             bench.run_ms(10_000);
             assert!(!bench.is_bootloader(NODE), "the program starts in the end");
         }
-        let is_whole = cells(&mut bench, home(new.len())) == new;
+        let is_whole = cells(&bench, home(new.len())) == new;
         assert!(is_whole, "confirmed: {confirmed}");
     }
     assert!(lacks_header, "no cut came directly after the erase");
@@ -365,7 +365,7 @@ fn a_cut_anywhere_leaves_a_bootloader_and_the_program() {
             call_back(&mut bench);
         }
         renew(&mut bench, &new).unwrap();
-        assert_eq!(cells(&mut bench, home(new.len())), new);
+        assert_eq!(cells(&bench, home(new.len())), new);
         assert_eq!(progress(&mut bench).state, State::Installed);
     }
 }
@@ -423,7 +423,7 @@ fn a_wrong_image_is_refused_before_an_erase() {
         let FlashStatus { error, detail: found, .. } = status(&mut bench);
         assert_eq!((error, found), (Some(FlashError::Format), detail));
         assert_eq!(progress(&mut bench).state, State::Staged);
-        assert_eq!(cells(&mut bench, staging), spare);
+        assert_eq!(cells(&bench, staging), spare);
     }
     assert_eq!(bench.events().into_iter().filter(|(_, stop)| matches!(stop, Stop::Reset(_))).count(), 0);
 }

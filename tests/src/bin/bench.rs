@@ -14,6 +14,8 @@ const BLOCK_SIZES: [usize; 2] = [1024, 4096];
 
 /// A row: its line in a table of text, and its object in JSON.
 type Row = (String, Value);
+/// What takes the rows of a table.
+type Rows<'a> = &'a mut dyn FnMut(Row);
 
 fn main() -> ExitCode {
     let json = match std::env::args().nth(1).as_deref() {
@@ -25,7 +27,7 @@ fn main() -> ExitCode {
         }
     };
     // Prints a table, row by row as they are measured, or returns it as JSON.
-    let table = |heads: &str, measure: &mut dyn FnMut(&mut dyn FnMut(Row))| -> Value {
+    let table = |heads: &str, measure: &mut dyn FnMut(Rows<'_>)| -> Value {
         if !json {
             println!("{heads}");
         }
