@@ -42,6 +42,8 @@ pub struct History {
     begun: Vec<(u8, Option<Content>)>,
     /// The highest security counter of a program that is there and counts, by program.
     proved: Vec<u32>,
+    /// The same, and of a program that may have proved itself before a cut.
+    may_be_proved: Vec<u32>,
     /// An owner has signed what he should not have.
     pub(crate) is_spoilt: bool,
     /// The sub-indices that an action has named since there was no work: these alone may change.
@@ -74,6 +76,7 @@ impl History {
             may_erase: false,
             begun: Vec::new(),
             proved: vec![0; seen.programs.len()],
+            may_be_proved: vec![0; seen.programs.len()],
             is_spoilt: false,
             named: BTreeSet::new(),
             asked: BTreeSet::new(),
@@ -181,6 +184,10 @@ impl History {
         let is_reset = seen.starts != self.seen.starts;
         let counters: Vec<_> =
             (1..).zip(&seen.programs).map(|(number, program)| counter_of(self, number, program)).collect();
+        for ((proved, counter), program) in self.may_be_proved.iter_mut().zip(&counters).zip(&seen.programs) {
+            let is_proved = program.record.is_some_and(|record| record.confirmed);
+            *proved = (*proved).max(if is_proved { *counter } else { program.counter });
+        }
         for ((proved, counter), program) in self.proved.iter_mut().zip(counters).zip(&seen.programs) {
             let Some(record) = program.record.filter(|_| seen.is_certain) else { continue };
             let counts = record.confirmed || !self.setup.config.download.seal.counter_with_confirmation;
@@ -243,6 +250,7 @@ pub const RULES: &[Rule] = &[
     Rule { name: "no security counter decreases", is_kept: counts },
     Rule { name: "no program is there before its security counter", is_kept: is_counted },
     Rule { name: "no program follows a proved one with a higher counter", is_kept: follows },
+    Rule { name: "with confirmation a counter waits for it", is_kept: waits },
     Rule { name: "a sealed bootloader follows one with a lower counter", is_kept: follows_home },
 ];
 
@@ -438,4 +446,17 @@ fn follows_home(before: &History, now: &Seen) -> bool {
     let counter = |crc| counter_of_image(setup, crc);
     let follows = |(staged, home)| counter(staged) > counter(home);
     !setup.takes_sealed || !is_certain || staged.zip(was.home).is_none_or(follows)
+}
+
+fn waits(before: &History, now: &Seen) -> bool {
+    let is_certain = before.seen.is_certain && now.is_certain && !before.is_spoilt;
+    let with_confirmation = before.setup.config.download.seal.counter_with_confirmation;
+    let mut programs = (1..).zip(&now.programs).zip(&before.may_be_proved);
+    !with_confirmation
+        || !is_certain
+        || programs.all(|((number, program), proved)| {
+            let is_proved = program.record.is_some_and(|record| record.confirmed);
+            let own = if is_proved { counter_of(before, number, program) } else { 0 };
+            program.counter <= own.max(*proved)
+        })
 }
