@@ -237,7 +237,7 @@ fields! { Head, head:
     manifest_size MANIFEST_SIZE: u16 = 4;
     /// Number of signatures.
     signatures SIGNATURES: u8 = 6;
-    /// See [`flag`](super::flag).
+    /// See the [flags](crate::wire::flag).
     flags FLAGS: u8 = 7;
     /// The vendor-ID of the devices for which the image is.
     vendor_id VENDOR_ID: u32 = 8;
@@ -399,7 +399,7 @@ fields! { Recipient, recipient:
     /// key stream.
     check CHECK: [u8; 8] = 4;
     /// The key of the image, exclusive-or bytes 0 to 31 of the key stream: HMAC-SHA-512 (RFC 2104)
-    /// with the key-encryption key over [`WRAP_DOMAIN`](super::WRAP_DOMAIN) and the nonce of the image.
+    /// with the key-encryption key over the [domain of key wrapping](crate::wire::WRAP_DOMAIN) and the nonce of the image.
     wrapped WRAPPED: [u8; 32] = 12;
 }
 
@@ -408,11 +408,11 @@ fields! { Recipient, recipient:
 pub struct Certificate<'a>(pub &'a [u8]);
 
 fields! { Certificate, certificate:
-    /// Its announced size: [`CERTIFICATE`](super::CERTIFICATE).
+    /// Its announced size: that of [a certificate](crate::wire::CERTIFICATE).
     size SIZE: u16 = 4;
-    /// See [`role`](super::role).
+    /// See the [roles](crate::wire::role).
     role ROLE: u8 = 6;
-    /// Algorithm of the key: [`ED25519`](super::ED25519).
+    /// Algorithm of the key: [Ed25519](crate::wire::ED25519).
     algorithm ALGORITHM: u8 = 7;
     /// A device accepts no certificate with an epoch lower than its own; a higher one becomes its
     /// own.
