@@ -9,6 +9,7 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::output::Failure;
+use super::units::table;
 use super::values::milliseconds;
 
 /// Lists the CAN adapters of this computer.
@@ -49,13 +50,7 @@ impl fmt::Display for Table<'_> {
         } else {
             let head = ["--bus", "what it is", "bit rate", "state"].map(str::to_string);
             let rows: Vec<[String; 4]> = std::iter::once(head).chain(found.iter().map(row)).collect();
-            let width =
-                |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or_default();
-            let widths: Vec<usize> = (0..4).map(width).collect();
-            for row in &rows {
-                let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}"));
-                writeln!(f, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-            }
+            f.write_str(&table(&rows))?;
         }
         if !missing.is_empty() {
             let kinds: Vec<&str> = missing.iter().map(|(kind, _)| kind.name()).collect();

@@ -1,5 +1,7 @@
 //! The options for the firmware file and how to read it, shared by `convert` and `flash`.
 
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -277,6 +279,18 @@ impl Input {
     pub(super) fn path(&self) -> &Path {
         &self.file
     }
+}
+
+/// The first bytes of a regular file; none if it cannot be read. A pipe would wait for its other end.
+pub(super) fn front(path: &Path, max: usize) -> Vec<u8> {
+    let mut front = Vec::new();
+    let is_file = std::fs::metadata(path).is_ok_and(|about| about.is_file());
+    let file = is_file.then(|| File::open(path).ok()).flatten();
+    if let Some(file) = file {
+        // The command that reads the whole file reports an error.
+        let _ = file.take(max as u64).read_to_end(&mut front);
+    }
+    front
 }
 
 /// Reads a whole firmware file.

@@ -10,10 +10,9 @@ use coflash_core::device::lock::Lock;
 use coflash_core::device::lss::{ensure_node_id, LssAddress};
 use coflash_core::device::Dialect;
 use coflash_core::file::convert::{blocks_of_sealed, Label};
-use coflash_core::file::limit::read_text;
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
-use coflash_core::machine::{Recipe, RecipeDevice, Row};
+use coflash_core::machine::{RecipeDevice, Row};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload};
 use seal::wire::BOOTLOADER;
@@ -28,7 +27,7 @@ use super::file::{bytes, warn, Source};
 use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
-use super::package::{is_package, Given, Machine, Typed};
+use super::package::{is_package, read_recipe, Given, Machine, Typed};
 use super::progress::Progress;
 use super::values::{nodes, number, program_number, watch_time};
 
@@ -221,17 +220,7 @@ impl Flash {
 
     /// Updates a machine with a package.
     fn machine(&self, context: &Context, package: &Path) -> Result<(), Failure> {
-        let flash = FlashOptions::default()
-            .repeats(self.block_repeats)
-            .watch(self.watch)
-            .dialect(self.access.dialect())
-            .unlock(self.access.unlock())
-            .wait(self.wait)
-            .alone(!self.not_alone)
-            .mastership(!self.no_mastership)
-            .from_start(self.from_start)
-            .verify(self.verify)
-            .together(self.together == Together::Always);
+        let flash = self.common_options().verify(self.verify).together(self.together == Together::Always);
         let given = Given {
             patience: &self.patience,
             bus: self.bus(context),
@@ -242,6 +231,19 @@ impl Flash {
             not_alone: self.not_alone,
         };
         self.machine.run(context, package, &given)
+    }
+
+    /// The options that mean the same for every file.
+    fn common_options(&self) -> FlashOptions {
+        FlashOptions::default()
+            .repeats(self.block_repeats)
+            .watch(self.watch)
+            .dialect(self.access.dialect())
+            .unlock(self.access.unlock())
+            .wait(self.wait)
+            .alone(!self.not_alone)
+            .mastership(!self.no_mastership)
+            .from_start(self.from_start)
     }
 
     /// The options for several devices.
@@ -337,10 +339,8 @@ impl Flash {
         type Known = (PathBuf, Option<String>, u8, Option<Dialect>, Payload);
         let mut known: Vec<Known> = Vec::new();
         let mut devices = Vec::new();
-        let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
-        let wrong = |fault| Failure::recipe(job, &fault);
-        let recipe = Recipe::parse(&text, job.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
-        for device in recipe.devices().map_err(wrong)? {
+        let recipe = read_recipe(job)?;
+        for device in recipe.devices().map_err(|fault| Failure::recipe(job, &fault))? {
             let row = device.row;
             let dialect = device.dialect.or(self.access.dialect());
             let (image, program) = (row.image.clone(), row.program.unwrap_or(self.number()));
@@ -406,22 +406,15 @@ impl Flash {
                 "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
             return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
         }
-        Ok(FlashOptions::default()
+        Ok(self
+            .common_options()
             .program(self.number())
-            .repeats(self.block_repeats)
             .check_target(named.or(of_file))
             .trial_run(trial)
-            .watch(self.watch)
             .start(start)
             .verify(row.and_then(|row| row.verify).unwrap_or(self.verify))
-            .dialect(self.access.dialect())
-            .unlock(self.access.unlock())
-            .wait(self.wait)
-            .alone(!self.not_alone)
-            .mastership(!self.no_mastership)
             .blocks(self.in_blocks.then(|| self.source.block_size()))
             .joined_blocks(self.source.joined_blocks())
-            .from_start(self.from_start)
             .force(self.force))
     }
 
@@ -471,19 +464,12 @@ impl Flash {
         let waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
         let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
         drop(waiting);
-        let report = match (&self.report, result) {
-            (None, result) => result?,
-            (Some(path), result) => {
-                let outcome = Outcome {
-                    node: Some(node),
-                    name: format!("node {node}"),
-                    image: device.image.display().to_string(),
-                    result,
-                };
-                write_report(path, &document(std::slice::from_ref(&outcome)))?;
-                outcome.result?
-            }
-        };
+        let (name, image) = (format!("node {node}"), device.image.display().to_string());
+        let outcome = Outcome { node: Some(node), name, image, result };
+        if let Some(path) = &self.report {
+            write_report(path, &document(std::slice::from_ref(&outcome)))?;
+        }
+        let report = outcome.result?;
         context.result(report, || {
             let mut value = json!(report);
             value["node"] = node.get().into();
@@ -504,28 +490,24 @@ impl Flash {
         for (number, device) in devices.iter().enumerate() {
             let image = device.image.display().to_string();
             let twice = |node| jobs.iter().any(|(_, job): &(usize, Job)| job.node == node);
-            let outcome = match self.node_of(link, device) {
-                Ok(node) if twice(node) => {
+            let mut node = device.node;
+            let begun = self.node_of(link, device).and_then(|own| {
+                node = Some(own);
+                if twice(own) {
                     let advice = "name each device once, and give each its own node-ID";
-                    let failure = Failure::usage(format!("node {node} is in the job twice"), advice);
-                    Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
+                    return Err(Failure::usage(format!("node {own} is in the job twice"), advice));
                 }
-                Ok(node) => match self.lock(context, node) {
-                    Ok(lock) => {
-                        locks.push(lock);
-                        let options = device.options.together(self.together == Together::Always);
-                        jobs.push((number, Job::new(node, device.file.clone(), options)));
-                        None
-                    }
-                    Err(failure) => {
-                        Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
-                    }
-                },
-                Err(failure) => {
-                    Some(Outcome { node: device.node, name: device.name(), image, result: Err(failure) })
+                Ok((own, self.lock(context, own)?))
+            });
+            outcomes.push(match begun {
+                Ok((node, lock)) => {
+                    locks.push(lock);
+                    let options = device.options.together(self.together == Together::Always);
+                    jobs.push((number, Job::new(node, device.file.clone(), options)));
+                    None
                 }
-            };
-            outcomes.push(outcome);
+                Err(failure) => Some(Outcome { node, name: device.name(), image, result: Err(failure) }),
+            });
         }
         let options = self.many_options()?;
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();

@@ -184,7 +184,7 @@ pub(super) fn in_order(command: Command) -> Command {
     let about = command.get_about().map(StyledStr::ansi).map(|about| about.to_string()).unwrap_or_default();
     let list = list(&command);
     let short = format!("{list}coflash COMMAND -h shows its options, coflash --help those of all commands.");
-    let long = format!("{about}.\n\n{list}\n{}\n{FIRST}\n\n{EXIT_CODES}", options.ansi());
+    let long = format!("{about}.\n\n{list}\nFor all commands:\n{}\n{FIRST}\n\n{EXIT_CODES}", options.ansi());
     let command = command.help_template("{usage-heading} {usage}\n\n{before-help}");
     below(command.mut_args(placed).before_help(short).before_long_help(long), "coflash")
 }
@@ -213,7 +213,8 @@ fn below(command: Command, path: &str) -> Command {
         let path = format!("{path} {}", command.get_name());
         let command = below(command.mut_args(placed), &path);
         let lines: String = examples(&path).iter().map(|line| format!("\n  coflash {line}")).collect();
-        if lines.is_empty() {
+        // The commands of a group show their own examples.
+        if lines.is_empty() || command.get_subcommands().any(Command::has_subcommands) {
             command
         } else {
             command.after_help(format!("Examples:{lines}"))

@@ -153,7 +153,7 @@ fn main() -> ExitCode {
     let cli = match command_line() {
         Ok(cli) => cli,
         Err(failure) => {
-            let output = early_output();
+            let output = Output::of_words();
             output.failure(&failure);
             output.exit(&failure)
         }
@@ -180,12 +180,6 @@ fn main() -> ExitCode {
     }
 }
 
-/// The options for output, as far as the command line can be read.
-fn early_output() -> Output {
-    let matches = commands().ignore_errors(true).get_matches_from(words());
-    Output::from_arg_matches(&matches).unwrap_or_default().or(Output::of_words())
-}
-
 /// The words of the command line, in the order for the parser.
 fn words() -> Vec<OsString> {
     words::ordered(std::env::args_os().map(words::typed).collect(), &commands())
@@ -196,7 +190,7 @@ fn words() -> Vec<OsString> {
 fn command_line() -> Result<Cli, Failure> {
     let read = parsed(words(), None)?;
     Ok(read.unwrap_or_else(|error| {
-        let out = early_output();
+        let out = Output::of_words();
         if error.use_stderr() {
             let failure = Failure::unreadable_line(&error);
             if out.for_programs() {

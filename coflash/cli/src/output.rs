@@ -285,9 +285,9 @@ pub(super) struct Failure {
 impl Failure {
     /// An error of a conversation. If the device is silent, the tool observes the bus to find the
     /// reason.
-    pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
-        let silent = matches!(error, Error::NoAnswer { .. }) && session.hears_the_bus();
-        let failure = Self::from(error);
+    pub(super) fn diagnosed(error: impl Into<Self>, session: &mut Session<'_>) -> Self {
+        let failure = error.into();
+        let silent = failure.exit == Exit::NoAnswer && session.hears_the_bus();
         match silent.then(|| diagnose(session)) {
             Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
             // The first error remains the reason.

@@ -1,9 +1,10 @@
 //! The files that commands write. None takes the place of a key, and a secret is for its owner alone.
 
 use std::fs;
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Write as _};
 use std::path::Path;
 
+use super::file::front;
 use super::output::Failure;
 
 /// The most bytes that a file with a key may have.
@@ -26,13 +27,9 @@ pub(super) fn spare(path: &Path) -> Result<(), Failure> {
 
 /// Whether a file has a private key or a key-encryption key in PEM.
 fn is_secret_key(path: &Path) -> bool {
-    let mut front = Vec::new();
-    // A pipe would wait for its other end.
-    let is_file = fs::metadata(path).is_ok_and(|about| about.is_file());
-    let file = is_file.then(|| fs::File::open(path).ok()).flatten();
-    let is_read = file.is_some_and(|file| file.take(LARGEST_KEY).read_to_end(&mut front).is_ok());
+    let front = front(path, LARGEST_KEY as usize);
     let begins = |line: &str| line.starts_with("-----BEGIN ") && line.contains("KEY-----");
-    is_read && String::from_utf8_lossy(&front).lines().any(|line| begins(line) && !line.contains("PUBLIC"))
+    String::from_utf8_lossy(&front).lines().any(|line| begins(line) && !line.contains("PUBLIC"))
 }
 
 /// Writes a file that only its owner may read. Replaces an existing file only if `overwrite` is

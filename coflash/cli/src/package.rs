@@ -2,7 +2,7 @@
 
 use std::collections::btree_map::Entry;
 use std::collections::BTreeMap;
-use std::io::{self, BufRead as _, IsTerminal as _, Read as _, Write as _};
+use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
 
 use canopen::NodeId;
@@ -22,6 +22,7 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::{cancelled, Patience};
+use super::file::front;
 use super::many::{write_report, Board};
 use super::output::{Exit, Failure};
 use super::output_file;
@@ -55,10 +56,8 @@ pub(super) struct MakePackage {
 impl MakePackage {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.recipe;
-        let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-        let wrong = |fault| Failure::recipe(path, &fault);
-        let recipe = Recipe::parse(&text, path.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
-        let parts = recipe.parts().map_err(wrong)?;
+        let recipe = read_recipe(path)?;
+        let parts = recipe.parts().map_err(|fault| Failure::recipe(path, &fault))?;
         let keys = self.key.iter().map(|path| signing_key(path)).collect::<Result<Vec<_>, _>>()?;
         let certificates =
             self.cert.iter().map(|path| keys::certificate(path)).collect::<Result<Vec<_>, _>>()?;
@@ -95,6 +94,13 @@ impl MakePackage {
     }
 }
 
+/// Reads a recipe, or a job file, which is one.
+pub(super) fn read_recipe(path: &Path) -> Result<Recipe, Failure> {
+    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    Recipe::parse(&text, folder).map_err(|fault| Failure::recipe(path, &fault))
+}
+
 /// Whether two paths lead to one file, which there is.
 fn is_same(one: &Path, other: &Path) -> bool {
     let real = |path: &Path| path.canonicalize().ok();
@@ -103,11 +109,7 @@ fn is_same(one: &Path, other: &Path) -> bool {
 
 /// Whether a file is one for a machine.
 pub(super) fn is_package(path: &Path) -> bool {
-    let is_file = std::fs::metadata(path).is_ok_and(|about| about.is_file());
-    let mut front = Vec::new();
-    let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
-    let is_read = is_file && std::fs::File::open(path).and_then(&mut read).is_ok();
-    machine::is_package(path, if is_read { &front } else { &[] })
+    machine::is_package(path, &front(path, machine::FRONT))
 }
 
 /// A package, and which of its signers belong to the roots that the user has named, if any was named.

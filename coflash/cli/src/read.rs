@@ -14,6 +14,7 @@ use super::dialect::Access;
 use super::objects::{self, Names, Object};
 use super::output::{Exit, Failure};
 use super::output_file;
+use super::units::hex;
 
 /// Reads objects; a program if the device allows it.
 ///
@@ -165,11 +166,6 @@ fn number(bytes: &[u8]) -> Option<u64> {
         return None;
     }
     Some(bytes.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte)))
-}
-
-fn hex(bytes: &[u8], between: &str) -> String {
-    let pairs: Vec<String> = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
-    pairs.join(between)
 }
 
 #[cfg(test)]

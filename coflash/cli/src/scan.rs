@@ -15,6 +15,7 @@ use serde_json::{json, Value};
 use super::context::Context;
 use super::device::cancelled;
 use super::output::Failure;
+use super::units::table;
 use super::values::{milliseconds, nodes};
 
 /// Lists the nodes on the bus.
@@ -84,13 +85,7 @@ impl std::fmt::Display for Table<'_> {
         let heads = ["node", "runs", "name", "software", "serial", "program", "heartbeat"];
         let rows =
             std::iter::once(heads.map(String::from)).chain(self.found.iter().map(row)).collect::<Vec<_>>();
-        let width = |column: usize| rows.iter().map(|row| row[column].len()).max().unwrap_or_default();
-        let widths: Vec<usize> = (0..heads.len()).map(width).collect();
-        for row in &rows {
-            let cells = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}"));
-            writeln!(f, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-        }
-        Ok(())
+        f.write_str(&table(&rows))
     }
 }
 

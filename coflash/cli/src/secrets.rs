@@ -60,7 +60,7 @@ fn hidden_from(text: &str, mark: char) -> (&str, String) {
 /// A URL without its scheme, with its secrets hidden.
 fn without_secrets(text: &str, is_web: bool) -> String {
     let (place, query) = hidden_from(text, '?');
-    // A bit rate is behind the last @ of an adapter's URL.
+    // A bit rate is after the last @ of an adapter's URL.
     let is_rate = |text: &str| {
         let digits = text.trim_end_matches(['k', 'K', 'M']);
         !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())

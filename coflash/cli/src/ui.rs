@@ -3,8 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_core::file::limit;
-use coflash_core::machine::{self, Package, Recipe};
+use coflash_core::machine::{self, Package};
 use coflash_ui::{Failed, Options, Origin, Server, Service};
 use serde_json::json;
 
@@ -113,10 +112,8 @@ fn of_job(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
         let advice = "leave --trust out, or make a signed package (coflash package)";
         return Err(Failure::usage("a job file has no signature", advice));
     }
-    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-    let wrong = |fault| Failure::recipe(path, &fault);
-    let recipe = Recipe::parse(&text, path.parent().unwrap_or(Path::new(""))).map_err(wrong)?;
-    let made =
-        machine::make(recipe.name.clone(), recipe.release.clone(), &recipe.parts().map_err(wrong)?, &[]);
+    let recipe = package::read_recipe(path)?;
+    let parts = recipe.parts().map_err(|fault| Failure::recipe(path, &fault))?;
+    let made = machine::make(recipe.name, recipe.release, &parts, &[]);
     made.and_then(|bytes| Package::parse(&bytes)).map_err(|fault| Failure::package(path, &fault))
 }

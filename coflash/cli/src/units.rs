@@ -8,6 +8,23 @@ pub(super) fn rate(bytes: f64) -> String {
     format!("{:.1} KiB/s", bytes / 1024.0)
 }
 
+/// Bytes in hexadecimal, with this text between them.
+pub(super) fn hex(bytes: &[u8], between: &str) -> String {
+    let pairs: Vec<String> = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
+    pairs.join(between)
+}
+
+/// Rows in columns of the same width, with two blanks between them.
+pub(super) fn table<const COLUMNS: usize>(rows: &[[String; COLUMNS]]) -> String {
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or_default();
+    let widths: [usize; COLUMNS] = std::array::from_fn(width);
+    let line = |row: &[String; COLUMNS]| {
+        let cells: Vec<_> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
+        format!("{}\n", cells.join("  ").trim_end())
+    };
+    rows.iter().map(line).collect()
+}
+
 /// The progress of a job of known length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Pace {

@@ -25,11 +25,11 @@ pub fn typed(word: OsString) -> OsString {
 pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     let mut kept: Vec<OsString> = Vec::new();
     let mut moved: Vec<(String, Vec<OsString>)> = Vec::new();
-    let mut rest = words.iter();
+    let mut remaining = words.iter();
     // The program's name.
-    kept.extend(rest.next().cloned());
+    kept.extend(remaining.next().cloned());
     let command = loop {
-        let Some(word) = rest.next() else { return words };
+        let Some(word) = remaining.next() else { return words };
         let Some(text) = word.to_str() else { return words };
         let Some(name) = Name::of(text) else {
             match root.find_subcommand(text) {
@@ -52,7 +52,7 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
         };
         let mut all = vec![word.clone()];
         if takes {
-            all.extend(rest.next().cloned());
+            all.extend(remaining.next().cloned());
         }
         if known {
             kept.extend(all);
@@ -62,9 +62,9 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     };
     // A subcommand of a command, for example `lss assign`.
     let mut levels = vec![(command, kept.len())];
-    let mut rest: Vec<OsString> = rest.cloned().collect();
-    while let Some(next) = rest.first().and_then(|word| levels.last()?.0.find_subcommand(word)) {
-        kept.push(rest.remove(0));
+    let mut remaining: Vec<OsString> = remaining.cloned().collect();
+    while let Some(next) = remaining.first().and_then(|word| levels.last()?.0.find_subcommand(word)) {
+        kept.push(remaining.remove(0));
         levels.push((next, kept.len()));
     }
     // Insert after the last command with this option, from the end on, so that earlier positions
@@ -81,7 +81,7 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     for (place, words) in moved.into_iter().rev() {
         kept.splice(place..place, words);
     }
-    kept.extend(rest);
+    kept.extend(remaining);
     kept
 }
 

@@ -7,14 +7,14 @@ use canopen::debugger::Stop;
 use clap::{Args, Subcommand};
 use coflash_core::device::debugger::{Debugger, NoBreakpoint, Registers, Stopped, BREAKPOINTS, NAMES};
 use coflash_core::device::value::hex_digits;
-use coflash_core::file::{limit, Place};
-use coflash_core::Error;
 use serde_json::{json, Value};
 
 use crate::context::Context;
 use crate::device::Device;
+use crate::file;
 use crate::output::Failure;
 use crate::output_file;
+use crate::units::hex;
 use crate::values::{milliseconds, number};
 
 /// Reads and writes memory, sets breakpoints and steps a device on the bench.
@@ -124,40 +124,16 @@ impl Debug {
         let mut session = self.device.session(&mut link)?;
         let node = session.node();
         let outcome = self.command.run(&mut Debugger::new(&mut session));
-        let Done { words, value } = match outcome {
-            Ok(done) => done,
-            Err(Trouble::Device(error)) => return Err(Failure::diagnosed(error, &mut session)),
-            Err(Trouble::Here(failure)) => return Err(failure),
-        };
-        context.result(format_args!("node {node}: {words}"), || {
-            let mut value = value;
-            value["node"] = node.get().into();
-            value
-        });
+        let Done { words, mut value } =
+            outcome.map_err(|failure| Failure::diagnosed(failure, &mut session))?;
+        value["node"] = node.get().into();
+        context.result(format_args!("node {node}: {words}"), || value);
         Ok(())
     }
 }
 
-/// The error of a subcommand, and where it occurred.
-enum Trouble {
-    Device(Error),
-    Here(Failure),
-}
-
-impl From<Error> for Trouble {
-    fn from(error: Error) -> Self {
-        Self::Device(error)
-    }
-}
-
-impl From<Failure> for Trouble {
-    fn from(failure: Failure) -> Self {
-        Self::Here(failure)
-    }
-}
-
 impl Command {
-    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Trouble> {
+    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Failure> {
         match self {
             Self::Read(read) => read.run(debugger),
             Self::Write(write) => write.run(debugger),
@@ -192,23 +168,22 @@ impl Command {
     }
 }
 
-fn stopped_program(debugger: &mut Debugger<'_, '_>) -> Result<Registers, Trouble> {
+fn stopped_program(debugger: &mut Debugger<'_, '_>) -> Result<Registers, Failure> {
     debugger.registers()?.ok_or_else(|| {
         Failure::usage(
             "the program is not stopped",
             "stop it with coflash more debug stop, or set a breakpoint",
         )
-        .into()
     })
 }
 
 /// Waits for a stop, and reports it.
-fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Trouble> {
+fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Failure> {
     let Some(Stopped { stop, address }) = debugger.await_stop(time)? else {
         let advice =
             "the program may never reach the instruction, or the instruction lies in code that cannot be stopped (docs/debugger.md)";
         let what = format!("the program has not stopped within {} ms", time.as_millis());
-        return Err(Failure::usage(what, advice).into());
+        return Err(Failure::usage(what, advice));
     };
     let (words, kind) = match stop {
         Stop::Breakpoint => ("stopped at a breakpoint at", "breakpoint"),
@@ -218,7 +193,7 @@ fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Trouble
                 "the code at {address:08X}h cannot be stopped: breakpoints are disabled, and the program continues"
             );
             let advice = "it belongs to an interrupt above the debugger, or runs in a critical section (docs/debugger.md)";
-            return Err(Failure::usage(what, advice).into());
+            return Err(Failure::usage(what, advice));
         }
     };
     Ok(Done {
@@ -228,7 +203,7 @@ fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Trouble
 }
 
 impl Read {
-    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Trouble> {
+    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Failure> {
         let bytes = debugger.read(self.address, self.len, &mut |_| {})?;
         let (address, len) = (self.address, bytes.len());
         if let Some(path) = &self.output {
@@ -237,30 +212,24 @@ impl Read {
             let value = json!({ "address": address, "size": len, "file": path.display().to_string() });
             return Ok(Done { words, value });
         }
-        let hex = hex(&bytes);
         Ok(Done {
             words: dump(address, &bytes),
-            value: json!({ "address": address, "size": len, "hex": hex.replace(' ', "") }),
+            value: json!({ "address": address, "size": len, "hex": hex(&bytes, "") }),
         })
     }
 }
 
 impl Write {
-    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Trouble> {
+    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Failure> {
         let bytes = match (&self.bytes, self.word, &self.input) {
             (Some(Bytes(bytes)), ..) => bytes.clone(),
             (None, Some(word), _) => word.to_le_bytes().to_vec(),
-            (None, None, Some(path)) => {
-                let read = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()));
-                read.map_err(Failure::from)?
-            }
+            (None, None, Some(path)) => file::bytes(path)?,
             // clap requires one of them.
             (None, None, None) => Vec::new(),
         };
         if bytes.is_empty() {
-            return Err(
-                Failure::usage("there are no bytes to write", "give a word, --bytes or --input").into()
-            );
+            return Err(Failure::usage("there are no bytes to write", "give a word, --bytes or --input"));
         }
         debugger.write(self.address, &bytes, &mut |_| {})?;
         Ok(Done {
@@ -271,13 +240,13 @@ impl Write {
 }
 
 impl Break {
-    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Trouble> {
+    fn run(&self, debugger: &mut Debugger<'_, '_>) -> Result<Done, Failure> {
         match (self.address, self.clear) {
             (None, true) => debugger.clear_all()?,
             (Some(address), true) => {
                 if !debugger.clear(address)? {
                     let what = format!("there is no breakpoint at {address:08X}h");
-                    return Err(Failure::usage(what, "list them with coflash more debug break").into());
+                    return Err(Failure::usage(what, "list them with coflash more debug break"));
                 }
             }
             (None, false) => {}
@@ -320,17 +289,14 @@ fn dump(address: u32, bytes: &[u8]) -> String {
     let line = |(n, bytes): (usize, &[u8])| {
         let at = address.wrapping_add(16 * n as u32);
         match <[u8; 4]>::try_from(bytes) {
-            Ok(word) if n == 0 => format!("{at:08X}h: {} ({:08X}h)", hex(bytes), u32::from_le_bytes(word)),
-            _ => format!("{at:08X}h: {}", hex(bytes)),
+            Ok(word) if n == 0 => {
+                format!("{at:08X}h: {} ({:08X}h)", hex(bytes, " "), u32::from_le_bytes(word))
+            }
+            _ => format!("{at:08X}h: {}", hex(bytes, " ")),
         }
     };
     let lines: Vec<String> = bytes.chunks(16).enumerate().map(line).collect();
     lines.join("\n")
-}
-
-fn hex(bytes: &[u8]) -> String {
-    let pairs: Vec<String> = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
-    pairs.join(" ")
 }
 
 /// `DE AD BE EF`, `DEADBEEF`.

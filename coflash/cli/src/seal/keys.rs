@@ -284,9 +284,9 @@ impl Show {
             return Err(Failure::file(path, why));
         };
         let public = public.map(|key| digits(&key.bytes()));
-        let behind = public.as_ref().map_or_else(String::new, |public| format!(", public key {public}"));
+        let more = public.as_ref().map_or_else(String::new, |public| format!(", public key {public}"));
         context.result(
-            format!("{}: {kind} {id:08X}h{behind}", path.display()),
+            format!("{}: {kind} {id:08X}h{more}", path.display()),
             || json!({ "kind": kind, "id": id, "public_key": public }),
         );
         Ok(())

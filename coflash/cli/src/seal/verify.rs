@@ -12,7 +12,7 @@ use serde_json::{json, Value};
 use shared_abi::block_file::ProgramVersion;
 
 use crate::context::Context;
-use crate::file::{base, bytes};
+use crate::file::{base, bytes, front};
 use crate::output::Failure;
 use crate::seal::keys::{self, KeyBlock};
 use crate::values::{number, program_number, unique_id};
@@ -169,11 +169,7 @@ pub(crate) fn show(context: &Context, path: &Path) -> Result<(), Failure> {
 /// Whether the file begins as a sealed image, or as a block file that carries one; `false` if it
 /// cannot be read.
 pub(crate) fn is_sealed(path: &Path) -> bool {
-    use std::io::Read as _;
-    let is_file = std::fs::metadata(path).is_ok_and(|about| about.is_file());
-    let mut front = Vec::new();
-    let mut read = |file: std::fs::File| file.take(blocks::FRONT as u64).read_to_end(&mut front);
-    is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && blocks::looks_like(&front)
+    blocks::looks_like(&front(path, blocks::FRONT))
 }
 
 /// Reads a sealed image, from the blocks of a block file if the file is one.

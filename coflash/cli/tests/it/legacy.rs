@@ -5,7 +5,7 @@ use std::net::TcpListener;
 use std::time::Duration;
 
 use super::adapters::serve_slcan;
-use crate::tool::{coflash, data, folder, run, Done};
+use crate::tool::{coflash, data, folder, run, typed, Done};
 use kit::fake::renewal::image;
 use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
@@ -64,19 +64,8 @@ fn with_legacy_exit_codes_the_program_ends_with_the_manuals_numbers() {
         (quick(BOOTLOADER), 0),
     ] {
         let (bus, server) = serve(fake);
-        let done = coflash(&[
-            "flash",
-            "--legacy-exit-codes",
-            "--bus",
-            &bus,
-            "-N",
-            "5",
-            &file,
-            "--boot-timeout",
-            "200",
-            "--sdo-timeout",
-            "100",
-        ]);
+        let times = "--boot-timeout 200 --sdo-timeout 100";
+        let done = typed(&format!("flash --legacy-exit-codes --bus {bus} -N 5 {file} {times}"));
         assert_eq!(done.exit, shown(number), "{number:08X}h: {}", done.err);
         server.join().unwrap();
     }

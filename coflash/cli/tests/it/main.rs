@@ -10,6 +10,7 @@ mod mistakes;
 mod package;
 mod renew;
 mod report;
+mod sealed_device;
 mod sealing;
 mod several;
 mod tool;
@@ -24,7 +25,7 @@ use std::time::Duration;
 
 use coflash_core::file::ihex;
 
-use crate::tool::{coflash, data, folder, run, snapshot};
+use crate::tool::{coflash, data, folder, run, snapshot, typed};
 use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 #[test]
@@ -41,20 +42,9 @@ fn convert_writes_the_block_file_of_the_manual() {
         ([&board[..], &identity, &release].concat(), "release-110.blk"),
         // The manual's own spelling.
         (
-            vec![
-                "-I",
-                "ihex",
-                "--block_size",
-                "0x110",
-                "--start_address",
-                "0x08010000",
-                "--end_address",
-                "0x080FFFFF",
-                "--vid",
-                "0",
-                "--pid",
-                "1234",
-            ],
+            "-I ihex --block_size 0x110 --start_address 0x08010000 --end_address 0x080FFFFF --vid 0 --pid 1234"
+                .split(' ')
+                .collect(),
             "identity-110.blk",
         ),
     ] {
@@ -381,19 +371,8 @@ fn the_date_comes_from_the_environment() {
     let out = folder.path("out.blk");
     let input = data("program.elf");
     let mut command = crate::tool::command();
-    command.args([
-        "convert",
-        &input,
-        &out,
-        "--block-size",
-        "0x110",
-        "--vid",
-        "0",
-        "--pid",
-        "1234",
-        "--ver",
-        "0x00640A01",
-    ]);
+    command.args(["convert", &input, &out, "--block-size", "0x110", "--vid", "0", "--pid", "1234"]);
+    command.args(["--ver", "0x00640A01"]);
     run(command.env("SOURCE_DATE_EPOCH", "1420070400")).good();
     assert!(fs::read(&out).unwrap() == fs::read(data("release-110.blk")).unwrap());
 }
@@ -576,22 +555,8 @@ fn the_target_is_checked_before_anything_is_erased() {
     let mut fake = Fake::new(BOOTLOADER);
     fake.erase_time = Duration::from_millis(30);
     let (bus, server) = serve(fake);
-    let done = coflash(&[
-        "--json",
-        "--bus",
-        &bus,
-        "flash",
-        "-N",
-        "5",
-        "--check-target",
-        "--vid",
-        "0x3F",
-        "--pid",
-        "1234",
-        "--no-start",
-        &plain,
-    ])
-    .good();
+    let target = "--check-target --vid 0x3F --pid 1234";
+    let done = typed(&format!("--json --bus {bus} flash -N 5 {target} --no-start {plain}")).good();
     let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!((&json["command"], &json["node"], &json["program"]), (&"flash".into(), &5.into(), &1.into()));
     assert_eq!((&json["size"], &json["running"]), (&4001.into(), &serde_json::Value::Null));

@@ -53,6 +53,11 @@ pub fn coflash(arguments: &[&str]) -> Done {
     run(command().args(arguments))
 }
 
+/// Runs the tool with the words of a line, none of which has a blank in it.
+pub fn typed(line: &str) -> Done {
+    run(command().args(line.split(' ')))
+}
+
 pub fn run(command: &mut Command) -> Done {
     let done = command.output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
