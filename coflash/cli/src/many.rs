@@ -9,16 +9,16 @@ use coflash_core::device::Session;
 use coflash_core::update::many::Failed;
 use coflash_core::update::{Event, Report};
 use coflash_core::Error;
-use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget};
 use serde_json::{json, Value};
 
 use super::events::Lines;
 use super::output::{Exit, Failure, Output};
 use super::output_file;
-use super::progress::with_rate;
 use super::record;
+use super::waiting::style;
 
-const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {rate:>12}  {msg}";
+pub(super) const STYLE: &str = "{prefix:<9} {bar:30} {percent:>3} %  {rate:>12}  {msg}";
 
 /// Progress of each device: a bar on a terminal, and otherwise lines that begin with the node.
 pub(super) struct Board {
@@ -45,10 +45,7 @@ impl Board {
             let all = MultiProgress::with_draw_target(ProgressDrawTarget::stdout());
             let bar = |name: &String| {
                 let bar = all.add(ProgressBar::new(1)).with_prefix(name.clone());
-                // The template is a constant. If it were wrong, a bar in another style is shown.
-                if let Ok(style) = ProgressStyle::with_template(STYLE) {
-                    bar.set_style(with_rate(style).progress_chars("=> "));
-                }
+                bar.set_style(style(STYLE));
                 bar.set_message("waiting");
                 bar
             };
@@ -188,14 +185,4 @@ fn outcome_value(outcome: &Outcome) -> Value {
         Err(failure) => all["error"] = failure.value()["error"].clone(),
     }
     all
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_bars_have_their_style() {
-        assert!(ProgressStyle::with_template(STYLE).is_ok());
-    }
 }

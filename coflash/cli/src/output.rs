@@ -289,7 +289,7 @@ impl Failure {
         let failure = error.into();
         let silent = failure.exit == Exit::NoAnswer && session.hears_the_bus();
         match silent.then(|| diagnose(session)) {
-            Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
+            Some(Ok(diagnosis)) => failure.advised(diagnosis),
             // The first error remains the reason.
             Some(Err(_)) | None => failure,
         }
@@ -301,10 +301,7 @@ impl Failure {
         let silent = matches!(error, Error::NoAnswer { .. });
         let failure = Self::from(error);
         match diagnosis.filter(|_| silent) {
-            Some(diagnosis) => {
-                let of_node = Diagnosis { node, ..diagnosis.clone() };
-                Self { advice: Some(of_node.to_string()), ..failure }
-            }
+            Some(diagnosis) => failure.advised(Diagnosis { node, ..diagnosis.clone() }),
             None => failure,
         }
     }
@@ -312,8 +309,7 @@ impl Failure {
     /// Several devices have failed, and the summary has shown the reasons. `legacy` is the exit
     /// code of the manual's tools, which handle one device, for the first failed device.
     pub(super) fn several(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
-        let what = format!("{failed} of {of} devices failed");
-        Self { is_shown: true, legacy, ..Self::new(exit, None, what, None) }
+        Self { legacy, ..Self::new(exit, format!("{failed} of {of} devices failed")).shown() }
     }
 
     /// Nothing on the bus is a device that a package is for.
@@ -321,7 +317,7 @@ impl Failure {
         let what = format!("{}: no device on the bus is one that the package is for", package.display());
         let advice =
             "look at the bus with coflash scan: check the bit rate, and that the package is for this machine";
-        Self::new(Exit::NoAnswer, None, what, Some(advice.to_string()))
+        Self::new(Exit::NoAnswer, what).advised(advice)
     }
 
     /// A device that differs from a file in `count` properties; each one was shown.
@@ -333,35 +329,46 @@ impl Failure {
         let advice =
             "flash the file, or find the file that the device was programmed with; coflash seal events shows \
                       what was installed";
-        Self { is_shown: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
+        Self::new(Exit::File, what).advised(advice).shown()
     }
 
     /// A device whose state or option bytes forbid its delivery; each reason was shown.
     pub(super) fn not_ready(node: NodeId) -> Self {
-        let advice = "do what each line says, and run the command again".to_string();
-        Self {
-            is_shown: true,
-            ..Self::new(Exit::Device, None, format!("node {node} is not ready"), Some(advice))
-        }
+        let advice = "do what each line says, and run the command again";
+        Self::new(Exit::Device, format!("node {node} is not ready")).advised(advice).shown()
     }
 
     /// A device that has failed `count` conformance checks; each one was shown.
     #[cfg(feature = "conform")]
     pub(super) fn nonconforming(node: NodeId, count: usize) -> Self {
-        let what = format!("node {node} has failed {count} of the checks");
-        Self { is_shown: true, ..Self::new(Exit::Device, None, what, None) }
+        Self::new(Exit::Device, format!("node {node} has failed {count} of the checks")).shown()
     }
 
     /// The device refused some of several objects; each refusal was shown. The exit code is that of
     /// the first refusal.
     pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
         let what = format!("{failed} of {of} objects could not be read");
-        Self { is_shown: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
+        Self { legacy: first.legacy, ..Self::new(first.exit, what).shown() }
     }
 
-    fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
-        let legacy = number.unwrap_or(exit.legacy());
-        Self { exit, number, legacy, what, left: None, advice, answers: Vec::new(), is_shown: false }
+    fn new(exit: Exit, what: impl Into<String>) -> Self {
+        let (legacy, what) = (exit.legacy(), what.into());
+        let (number, left, advice, answers) = (None, None, None, Vec::new());
+        Self { exit, number, legacy, what, left, advice, answers, is_shown: false }
+    }
+
+    /// The same failure with the manual's number, which is its exit code for the manual's tools.
+    fn numbered(self, number: u32) -> Self {
+        Self { number: Some(number), legacy: number, ..self }
+    }
+
+    fn advised(self, advice: impl ToString) -> Self {
+        Self { advice: Some(advice.to_string()), ..self }
+    }
+
+    /// The same failure, which the output of the command has shown already.
+    fn shown(self) -> Self {
+        Self { is_shown: true, ..self }
     }
 
     /// An error of the command line's parser.
@@ -378,15 +385,14 @@ impl Failure {
 
     /// An error in a recipe.
     pub(super) fn recipe(path: &Path, fault: &machine::RecipeFault) -> Self {
-        Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
+        Self::new(Exit::File, format!("{}, {fault}", path.display()))
     }
 
     /// A package that breaks a rule.
     pub(super) fn package(path: &Path, fault: &machine::Fault) -> Self {
-        let (what, advice) = (format!("{} {fault}", path.display()), fault.advice().to_string());
-        // The manual's tools do not know such files.
-        let legacy = Exit::File.legacy();
-        Self { legacy, ..Self::new(Exit::File, Some(fault.number()), what, Some(advice)) }
+        // The manual's tools do not know such files, and have no number for them.
+        let failure = Self::new(Exit::File, format!("{} {fault}", path.display()));
+        Self { number: Some(fault.number()), ..failure.advised(fault.advice()) }
     }
 
     /// A device of a package that was not begun.
@@ -395,8 +401,8 @@ impl Failure {
             machine::DeviceFault::Absent { .. } | machine::DeviceFault::TooFew { .. } => Exit::NoAnswer,
             _ => Exit::Device,
         };
-        let advice = Some(fault.advice().to_string());
-        Self { legacy: exit.legacy(), ..Self::new(exit, Some(fault.number()), fault.to_string(), advice) }
+        let failure = Self::new(exit, fault.to_string()).advised(fault.advice());
+        Self { number: Some(fault.number()), ..failure }
     }
 
     /// The same failure, with the state of the device.
@@ -405,25 +411,27 @@ impl Failure {
     }
 
     pub(super) fn usage(what: impl Into<String>, advice: impl Into<String>) -> Self {
-        Self::new(Exit::Usage, None, what.into(), Some(advice.into()))
+        Self::new(Exit::Usage, what).advised(advice.into())
     }
 
     /// A message of the command line's parser, which contains its advice.
     pub(super) fn bare_usage(words: String) -> Self {
-        let what = words.strip_prefix("error: ").unwrap_or(&words).trim_end().to_string();
-        Self::new(Exit::Usage, None, what, None)
+        Self::new(Exit::Usage, words.strip_prefix("error: ").unwrap_or(&words).trim_end())
     }
 
     /// A file, other than firmware, that cannot be read.
     pub(super) fn unreadable(path: &Path, error: &io::Error) -> Self {
         let number = error.raw_os_error().and_then(|code| u32::try_from(code).ok());
-        let what = format!("{}: cannot be read: {error}", path.display());
-        Self::new(Exit::File, number, what, None)
+        let failure = Self::new(Exit::File, format!("{}: cannot be read: {error}", path.display()));
+        match number {
+            Some(number) => failure.numbered(number),
+            None => failure,
+        }
     }
 
     /// A file, other than firmware, with invalid contents.
     pub(super) fn file(path: &Path, why: impl fmt::Display) -> Self {
-        Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
+        Self::new(Exit::File, format!("{}: {why}", path.display()))
     }
 
     /// There is no such board, or its file has a mistake.
@@ -436,35 +444,31 @@ impl Failure {
 
     /// An error in a line of a file, other than firmware.
     pub(super) fn line(path: &Path, line: usize, why: impl fmt::Display) -> Self {
-        let what = format!("{}, line {line}: {why}", path.display());
-        Self::new(Exit::File, None, what, None)
+        Self::new(Exit::File, format!("{}, line {line}: {why}", path.display()))
     }
 
     pub(super) fn system(what: String) -> Self {
-        Self::new(Exit::System, None, what, None)
+        Self::new(Exit::System, what)
     }
 
     /// A device that sent no boot-up message after a reset.
     pub(super) fn no_boot_up(node: NodeId) -> Self {
         let advice = "check that node-ID and bit rate are right; a device with a new node-ID comes back under that one";
-        let what = format!("node {node} has sent no boot-up message");
-        let advice = Some(advice.to_string());
-        Self::new(Exit::NoAnswer, Some(0x6000_0013), what, advice)
+        let failure = Self::new(Exit::NoAnswer, format!("node {node} has sent no boot-up message"));
+        failure.numbered(0x6000_0013).advised(advice)
     }
 
     /// A firmware file that cannot contain a program.
     pub(super) fn no_program(path: &Path, fault: judge::Fault) -> Self {
-        let (what, advice) = (format!("{}: {fault}", path.display()), fault.advice().to_string());
-        Self::new(Exit::File, Some(judge::Fault::NUMBER), what, Some(advice))
+        let failure = Self::new(Exit::File, format!("{}: {fault}", path.display()));
+        failure.numbered(judge::Fault::NUMBER).advised(fault.advice())
     }
 
     /// A sealed image that breaks a rule.
     pub(super) fn sealed(path: &Path, refusal: &Refusal) -> Self {
-        let number = Some(refusal_number(refusal));
-        let (what, advice) = (format!("{}: {refusal}", path.display()), refusal.advice().to_string());
-        // The manual's tools do not know such files.
-        let legacy = Exit::File.legacy();
-        Self { legacy, ..Self::new(Exit::File, number, what, Some(advice)) }
+        // The manual's tools do not know such files, and have no number for them.
+        let failure = Self::new(Exit::File, format!("{}: {refusal}", path.display()));
+        Self { number: Some(refusal_number(refusal)), ..failure.advised(refusal.advice()) }
     }
 
     /// A program number that a board does not have.
@@ -494,7 +498,7 @@ impl Failure {
             | ConvertError::Start(_)
             | ConvertError::Range(_)
             | ConvertError::Adjust(_)
-            | ConvertError::Blocks(_) => Self::new(Exit::Usage, Some(0x6000_0018), error.to_string(), None),
+            | ConvertError::Blocks(_) => Self::new(Exit::Usage, error.to_string()).numbered(0x6000_0018),
         }
     }
 
@@ -571,7 +575,7 @@ impl From<FileError> for Failure {
             _ => "",
         };
         let advice = Some(advice.to_string()).filter(|advice| !advice.is_empty());
-        Self::new(Exit::File, Some(cause.number()), error.to_string(), advice)
+        Self { advice, ..Self::new(Exit::File, error.to_string()).numbered(cause.number()) }
     }
 }
 
@@ -614,14 +618,9 @@ impl From<Error> for Failure {
             | Error::Unconfirmable { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
-        let legacy = legacy::exit_code(&error);
-        let answers = error.answers();
-        let number = Some(error.number());
-        Self {
-            legacy,
-            answers,
-            ..Self::new(exit, number, error.to_string(), Some(error.advice().to_string()))
-        }
+        let failure = Self::new(exit, error.to_string()).advised(error.advice());
+        let (number, legacy) = (Some(error.number()), legacy::exit_code(&error));
+        Self { number, legacy, answers: error.answers(), ..failure }
     }
 }
 

@@ -5,14 +5,14 @@ use std::time::Instant;
 
 use canopen::NodeId;
 use coflash_core::update::Event;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use super::output::Output;
-use super::units::{rate, Pace};
-use super::waiting::{waits_until, Waiting};
+use super::units::Pace;
+use super::waiting::{style, waits_until, Waiting};
 use super::{events, record};
 
-const STYLE: &str = "{bar:40} {percent:>3} %  {pos} of {len} bytes, {rate}, {left} left";
+pub(super) const STYLE: &str = "{bar:40} {percent:>3} %  {pos} of {len} bytes, {rate}, {left} left";
 
 /// Shows the events of an update.
 pub(super) struct Progress {
@@ -98,33 +98,6 @@ impl Progress {
     }
 }
 
-/// Adds rate and remaining time in this tool's units to a bar.
-pub(super) fn with_rate(style: ProgressStyle) -> ProgressStyle {
-    // An error of the drawing code does not stop the command.
-    style
-        .with_key("rate", |state: &ProgressState, text: &mut dyn std::fmt::Write| {
-            let _ = write!(text, "{}", rate(state.per_sec()));
-        })
-        .with_key("left", |state: &ProgressState, text: &mut dyn std::fmt::Write| {
-            let _ = write!(text, "{:.0} s", state.eta().as_secs_f64());
-        })
-}
-
 fn new_bar(total: usize) -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stdout());
-    match ProgressStyle::with_template(STYLE) {
-        Ok(style) => bar.with_style(with_rate(style).progress_chars("=> ")),
-        // The template is a constant. If it were wrong, a bar in another style is shown.
-        Err(_) => bar,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_bar_has_its_style() {
-        assert!(ProgressStyle::with_template(STYLE).is_ok());
-    }
+    ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stdout()).with_style(style(STYLE))
 }

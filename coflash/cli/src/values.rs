@@ -1,5 +1,6 @@
 //! Values on the command line, in the notations of the manual's tools.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use canopen::{Address, NodeId};
@@ -37,19 +38,19 @@ pub(super) fn nodes(text: &str) -> Result<Vec<NodeId>, String> {
     Ok(nodes)
 }
 
+/// A number in a range, or these words.
+fn within(text: &str, range: RangeInclusive<u32>, wrong: &str) -> Result<u32, String> {
+    Some(number(text)?).filter(|number| range.contains(number)).ok_or_else(|| wrong.to_string())
+}
+
 /// A program number: 1 to 254, the sub-indices of 1F50h.
 pub(super) fn program_number(text: &str) -> Result<u8, String> {
-    match u8::try_from(number(text)?) {
-        Ok(program @ 1..=254) => Ok(program),
-        _ => Err("programs are 1 to 254".to_string()),
-    }
+    within(text, 1..=254, "programs are 1 to 254").map(|number| number as u8)
 }
 
 pub(super) fn milliseconds(text: &str) -> Result<Duration, String> {
-    match number(text)? {
-        0 => Err("it must be at least 1 millisecond".to_string()),
-        millis => Ok(Duration::from_millis(millis.into())),
-    }
+    let millis = within(text, 1..=u32::MAX, "it must be at least 1 millisecond")?;
+    Ok(Duration::from_millis(millis.into()))
 }
 
 /// The time for which a program is watched: milliseconds, 0 for not at all.
@@ -59,18 +60,13 @@ pub(super) fn watch_time(text: &str) -> Result<Duration, String> {
 
 /// A COB-ID to which a node-ID can be added.
 pub(super) fn base_id(text: &str) -> Result<u16, String> {
-    match u16::try_from(number(text)?) {
-        Ok(id @ 0x80..=0x780) => Ok(id),
-        _ => Err("it must be 0x80 to 0x780, so that a node-ID can be added".to_string()),
-    }
+    let wrong = "it must be 0x80 to 0x780, so that a node-ID can be added";
+    within(text, 0x80..=0x780, wrong).map(|id| id as u16)
 }
 
 /// A number of attempts, at least one.
 pub(super) fn attempts(text: &str) -> Result<u32, String> {
-    match number(text)? {
-        0 => Err("it must be at least 1".to_string()),
-        times => Ok(times),
-    }
+    within(text, 1..=u32::MAX, "it must be at least 1")
 }
 
 /// An object: `1018/4`, `1018h/4`, `0x1018/0x04`, `100A`.

@@ -1,13 +1,33 @@
 //! Shows what the tool waits for, on a terminal only.
 
+use std::fmt::Write;
 use std::time::Duration;
 
 use coflash_core::update::event::{Event, Phase};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use super::output::Output;
+use super::units::rate;
 
 const STYLE: &str = "{spinner} {msg} ({waited})";
+
+/// A style with times and rates in this tool's units. The templates are constants; if one were wrong,
+/// another style is shown.
+pub(super) fn style(template: &str) -> ProgressStyle {
+    let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    // An error of the drawing code does not stop the command.
+    style
+        .progress_chars("=> ")
+        .with_key("rate", |state: &ProgressState, text: &mut dyn Write| {
+            let _ = write!(text, "{}", rate(state.per_sec()));
+        })
+        .with_key("left", |state: &ProgressState, text: &mut dyn Write| {
+            let _ = write!(text, "{:.0} s", state.eta().as_secs_f64());
+        })
+        .with_key("waited", |state: &ProgressState, text: &mut dyn Write| {
+            let _ = write!(text, "{} s", state.elapsed().as_secs());
+        })
+}
 
 /// The period of the spinner's steps.
 const TURN: Duration = Duration::from_millis(120);
@@ -21,16 +41,7 @@ impl Waiting {
     pub(super) fn new(out: Output, what: impl Into<String>) -> Self {
         Self(out.shows_waiting().then(|| {
             let spinner = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-            // The template is a constant. If it were wrong, another style is shown.
-            if let Ok(style) = ProgressStyle::with_template(STYLE) {
-                spinner.set_style(style.with_key(
-                    "waited",
-                    |state: &ProgressState, text: &mut dyn std::fmt::Write| {
-                        // An error of the drawing code does not stop the command.
-                        let _ = write!(text, "{} s", state.elapsed().as_secs());
-                    },
-                ));
-            }
+            spinner.set_style(style(STYLE));
             spinner.set_message(format!("waiting until {}", what.into()));
             spinner.enable_steady_tick(TURN);
             spinner
@@ -70,8 +81,11 @@ pub(super) fn waits_until(event: &Event) -> &'static str {
 mod tests {
     use super::*;
 
+    /// The spinner, and the bars of one device and of many.
     #[test]
-    fn it_has_its_style() {
-        assert!(ProgressStyle::with_template(STYLE).is_ok());
+    fn every_template_is_a_style() {
+        for template in [STYLE, super::super::progress::STYLE, super::super::many::STYLE] {
+            assert!(ProgressStyle::with_template(template).is_ok(), "{template}");
+        }
     }
 }
