@@ -160,7 +160,11 @@ fn main() -> ExitCode {
     };
     let Cli { context, command } = &cli;
     let (out, log) = (context.out, context.log_file.as_deref());
-    let begin = || record::begin(context, &words(), command.password()).map_err(Failure::system);
+    let begin = || {
+        let (log, reports) = (context.log_file.as_deref(), context.report_dir.as_deref());
+        record::begin(log, reports, &context.command, &words(), command.password(), context.bus.as_deref())
+            .map_err(Failure::system)
+    };
     let spared = [log, context.trace.as_deref()].into_iter().flatten().try_for_each(output_file::spare);
     let result = spared.and_then(|()| begin()).and_then(|()| command.run(context));
     if let Err(failure) = &result {

@@ -18,7 +18,6 @@ use coboot_can::{wall, Adapter, Tap};
 use coflash_core::update::{stamp, Event, Histories};
 use serde_json::{json, Value};
 
-use super::context::Context;
 use super::secrets;
 
 /// The files of a run's folder: the report, the events, the messages, the frames.
@@ -75,23 +74,28 @@ fn cannot(path: &Path, error: &io::Error) -> String {
     format!("{}: cannot be written: {error}", path.display())
 }
 
-/// Starts the records that the command line asks for.
-pub(super) fn begin(context: &Context, words: &[OsString], password: Option<&str>) -> Result<(), String> {
-    let mut logs = Vec::new();
-    if let Some(log) = &context.log_file {
-        logs.push(Sink::new(log)?);
-    }
-    let report = match &context.report_dir {
+/// Starts the records that the command line asks for. `command` is the command's full name; the folder
+/// has it, too.
+pub(super) fn begin(
+    log: Option<&Path>,
+    reports: Option<&Path>,
+    command: &str,
+    words: &[OsString],
+    password: Option<&str>,
+    bus: Option<&str>,
+) -> Result<(), String> {
+    let mut logs: Vec<Sink> = log.map(Sink::new).transpose()?.into_iter().collect();
+    let report = match reports {
         Some(folder) => {
-            let folder = own_folder(folder, &context.command.replace(' ', "-"))?;
+            let folder = own_folder(folder, &command.replace(' ', "-"))?;
             let [_, events, messages, frames] = FILES.map(|file| folder.join(file));
             logs.push(Sink::new(&messages)?);
             let document = json!({
                 "coflash": env!("COFLASH_VERSION"),
                 "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
-                "command": context.command,
+                "command": command,
                 "command_line": secrets::without(words, password),
-                "bus": context.bus,
+                "bus": bus,
                 "began": stamp(wall()),
                 "ended": null,
             });
