@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use canopen::NodeId;
-use clap::{Args, ValueEnum};
+use clap::{Args, Command, ValueEnum};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::lss::{ensure_node_id, LssAddress};
@@ -196,7 +196,7 @@ impl Flash {
         }
         self.legacy.check(context)?;
         let package = self.image().filter(|file| is_package(file));
-        self.typed.check(package.is_some())?;
+        self.typed.check(package.is_some(), &options())?;
         if let Some(package) = package {
             return self.machine(context, package);
         }
@@ -558,6 +558,26 @@ impl Assignment {
             (Some(node), _) => format!("node {node}"),
             (None, Some(address)) => format!("device with serial number {:08X}h", address.serial_number),
             (None, None) => "device".to_string(),
+        }
+    }
+}
+
+/// The command with its options.
+pub(super) fn options() -> Command {
+    Flash::augment_args(Command::new("flash"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::package::{BESIDE_PACKAGES, FOR_PACKAGES};
+
+    /// An option of `flash` that is not in the list is refused beside a package.
+    #[test]
+    fn the_options_beside_a_package_are_options_of_flash() {
+        let flash = options();
+        for id in BESIDE_PACKAGES.iter().chain(FOR_PACKAGES.iter().map(|(id, _)| id)) {
+            assert!(flash.get_arguments().any(|argument| argument.get_id() == id), "{id}");
         }
     }
 }

@@ -7,6 +7,7 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::file::{Input, Source};
+use super::flash;
 use super::output::Failure;
 use super::package::{self, Trusted, Typed};
 use super::seal::verify::{is_sealed, show};
@@ -43,7 +44,7 @@ impl Inspect {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
         let is_package = package::is_package(path);
-        self.typed.check(is_package)?;
+        self.typed.check(is_package, &flash::options())?;
         if is_package {
             return package::inspect(context, path, &self.trusted);
         }

@@ -13,6 +13,7 @@ use self::output::{Failure, Output};
 mod adapters;
 #[cfg(feature = "agent")]
 mod agent;
+mod catch;
 mod config;
 mod context;
 mod convert;
@@ -138,7 +139,7 @@ impl Command {
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
             Self::Adapters(adapters) => adapters.run(context),
-            Self::More(more) => more.run(context),
+            Self::More(more) => more.run(context, shell_line),
         }
     }
 }

@@ -218,7 +218,7 @@ impl Checked {
 
 /// The options of `flash` that do beside a package what they do beside another file. A package has values
 /// for the others.
-const BESIDE_PACKAGES: [&str; 31] = [
+pub(super) const BESIDE_PACKAGES: [&str; 31] = [
     // What is done, and where it is said.
     "file",
     "legacy_file",
@@ -256,7 +256,7 @@ const BESIDE_PACKAGES: [&str; 31] = [
 ];
 
 /// The options for packages alone, and what they would do.
-const FOR_PACKAGES: [(&str, &str); 2] = [
+pub(super) const FOR_PACKAGES: [(&str, &str); 2] = [
     ("yes", "only the update with a package is confirmed"),
     ("trust", "only the signers of a package are compared with --trust"),
 ];
@@ -266,21 +266,20 @@ const FOR_PACKAGES: [(&str, &str); 2] = [
 pub(super) struct Typed(Vec<String>);
 
 impl Typed {
-    /// Refuses an option that means nothing for a package, or for any other file.
-    pub(super) fn check(&self, is_package: bool) -> Result<(), Failure> {
+    /// Refuses an option that means nothing for a package, or for any other file. `flash` is the command
+    /// with its options.
+    pub(super) fn check(&self, is_package: bool, flash: &Command) -> Result<(), Failure> {
         let is_typed = |id: &str| self.0.iter().any(|typed| typed == id);
         let mut alone = FOR_PACKAGES.iter().filter(|(id, _)| is_typed(id));
         if let (false, Some((_, what))) = (is_package, alone.next()) {
             let advice = "leave --yes and --trust out, or name a package that coflash package made";
             return Err(Failure::usage(*what, advice));
         }
-        let commands = super::commands();
-        let options = commands.find_subcommand("flash").map(Command::get_arguments).into_iter().flatten();
         let is_free =
             |id: &str| BESIDE_PACKAGES.contains(&id) || FOR_PACKAGES.iter().any(|(alone, _)| *alone == id);
         let refused =
             |option: &&Arg| is_typed(option.get_id().as_str()) && !is_free(option.get_id().as_str());
-        let option = options.filter(|_| is_package).find(refused).and_then(Arg::get_long);
+        let option = flash.get_arguments().filter(|_| is_package).find(refused).and_then(Arg::get_long);
         let Some(option) = option else { return Ok(()) };
         let advice = "leave it out: the package says which device gets which program";
         Err(Failure::usage(format!("--{option} has no meaning beside a package"), advice))
@@ -494,19 +493,4 @@ fn summary(
     let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
     let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
     Err(Failure::several(exit, first.legacy, failed, all))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// An option of `flash` that is not in the list is refused beside a package.
-    #[test]
-    fn the_options_beside_a_package_are_options_of_flash() {
-        let command = super::super::commands();
-        let flash = command.find_subcommand("flash").unwrap();
-        for id in BESIDE_PACKAGES.iter().chain(FOR_PACKAGES.iter().map(|(id, _)| id)) {
-            assert!(flash.get_arguments().any(|argument| argument.get_id() == id), "{id}");
-        }
-    }
 }

@@ -12,9 +12,9 @@ use coflash_core::update::steps::{
 use coflash_core::Error;
 use serde_json::{json, Value};
 
+use super::catch::{self, Limit};
 use super::context::Context;
 use super::device::Program;
-use super::more::catch::{self, Limit};
 use super::output::Failure;
 
 /// Starts the program, and waits until it answers.

@@ -9,6 +9,7 @@ use serde_json::json;
 
 use super::context::Context;
 use super::device::cancelled;
+use super::flash;
 use super::memory;
 use super::output::Failure;
 use super::package::{self, Trusted, Typed};
@@ -60,7 +61,7 @@ impl Ui {
         options.kinds = context.kinds();
         options.failed = Failed::new(|update| record::failed(update, &[]));
         options.sdo_ids = context.sdo_ids();
-        self.typed.check(self.service.is_some())?;
+        self.typed.check(self.service.is_some(), &flash::options())?;
         if let Some(path) = &self.service {
             options.service = Some(self.station(context, path)?);
         }

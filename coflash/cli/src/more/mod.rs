@@ -1,6 +1,5 @@
 //! `coflash more`: the commands that few people need every day.
 
-pub(crate) mod catch;
 #[cfg(feature = "conform")]
 mod conform;
 mod debug;
@@ -10,6 +9,7 @@ mod shell;
 
 use clap::Subcommand;
 
+use crate::catch;
 use crate::context::Context;
 use crate::output::Failure;
 use crate::program::{Release, Status, Withdraw};
@@ -36,7 +36,8 @@ impl More {
         !matches!(self, Self::Report(_) | Self::Completions(_) | Self::Man(_))
     }
 
-    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+    /// Runs the command; the shell runs each of its lines with `line`.
+    pub(crate) fn run(&self, context: &Context, line: shell::Runner) -> Result<(), Failure> {
         match self {
             Self::Status(status) => status.run(context),
             Self::Catch(catch) => catch.run(context),
@@ -44,7 +45,7 @@ impl More {
             Self::Withdraw(withdraw) => withdraw.run(context),
             Self::Debug(debug) => debug.run(context),
             Self::Report(report) => report.run(context),
-            Self::Shell(shell) => shell.run(context),
+            Self::Shell(shell) => shell.run(context, line),
             #[cfg(feature = "conform")]
             Self::Conform(conform) => conform.run(context),
             Self::Completions(completions) => completions.run(),

@@ -21,9 +21,12 @@ use crate::output::Failure;
 #[derive(Debug, Args)]
 pub(crate) struct Shell {}
 
+/// Runs one line of the shell.
+pub(crate) type Runner = fn(&Context, Vec<String>) -> Result<(), Failure>;
+
 impl Shell {
-    /// Reads commands and runs each of them.
-    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+    /// Reads commands and runs each of them with `command`.
+    pub(crate) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
         let history = interactive.then(|| memory::file("history")).flatten();
         let mut editor = DefaultEditor::new()
@@ -50,7 +53,7 @@ impl Shell {
                 let _ = editor.add_history_entry(&line);
             }
             cancelled()?.store(false, Ordering::Relaxed);
-            match (crate::shell_line(context, words), interactive) {
+            match (command(context, words), interactive) {
                 (Ok(()), _) => {}
                 (Err(failure), true) => context.out.failure(&failure),
                 (Err(failure), false) => return Err(failure),
