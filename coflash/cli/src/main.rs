@@ -139,7 +139,7 @@ impl Command {
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
             Self::Adapters(adapters) => adapters.run(context),
-            Self::More(more) => more.run(context, shell_line),
+            Self::More(more) => more.run(context, shell_line, commands()),
         }
     }
 }

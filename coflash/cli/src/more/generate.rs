@@ -30,18 +30,18 @@ pub(crate) struct Manual {
 }
 
 impl Completions {
-    pub(crate) fn run(&self) -> Result<(), Failure> {
+    pub(crate) fn run(&self, mut commands: Command) -> Result<(), Failure> {
         // Written to memory first: clap's own writer panics if standard output is closed.
         let mut script = Vec::new();
-        clap_complete::generate(self.shell, &mut crate::commands(), "coflash", &mut script);
+        clap_complete::generate(self.shell, &mut commands, "coflash", &mut script);
         let _ = std::io::stdout().write_all(&script);
         Ok(())
     }
 }
 
 impl Manual {
-    pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let mut commands = crate::commands().disable_help_subcommand(true);
+    pub(crate) fn run(&self, context: &Context, commands: Command) -> Result<(), Failure> {
+        let mut commands = commands.disable_help_subcommand(true);
         commands.build();
         let Some(folder) = &self.out else {
             let page = page(&commands)

@@ -7,7 +7,7 @@ mod generate;
 mod report;
 mod shell;
 
-use clap::Subcommand;
+use clap::{Command, Subcommand};
 
 use crate::catch;
 use crate::context::Context;
@@ -36,8 +36,13 @@ impl More {
         !matches!(self, Self::Report(_) | Self::Completions(_) | Self::Man(_))
     }
 
-    /// Runs the command; the shell runs each of its lines with `line`.
-    pub(crate) fn run(&self, context: &Context, line: shell::Runner) -> Result<(), Failure> {
+    /// Runs the command; the shell runs each of its lines with `line`. `commands` are those of the program.
+    pub(crate) fn run(
+        &self,
+        context: &Context,
+        line: shell::Runner,
+        commands: Command,
+    ) -> Result<(), Failure> {
         match self {
             Self::Status(status) => status.run(context),
             Self::Catch(catch) => catch.run(context),
@@ -48,8 +53,8 @@ impl More {
             Self::Shell(shell) => shell.run(context, line),
             #[cfg(feature = "conform")]
             Self::Conform(conform) => conform.run(context),
-            Self::Completions(completions) => completions.run(),
-            Self::Man(manual) => manual.run(context),
+            Self::Completions(completions) => completions.run(commands),
+            Self::Man(manual) => manual.run(context, commands),
         }
     }
 }
