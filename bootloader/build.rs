@@ -119,11 +119,11 @@ fn resident(package: &Path, out: &Path, layout: &Layout, product: &str) {
     cargo.args(["--config", "env.COBOOT_PRODUCT.force=true"]);
     // The inner build keeps these settings; all others concern only the outer build.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
-    let told = env::vars_os().map(|(name, _)| name).filter(|name| {
+    let reported = env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();
         name == "RUSTC_WORKSPACE_WRAPPER" || name.starts_with("CARGO") && !own.contains(&&*name)
     });
-    for variable in told {
+    for variable in reported {
         cargo.env_remove(variable);
     }
     let status = cargo.status().expect("cargo can be started");

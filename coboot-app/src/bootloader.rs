@@ -213,10 +213,10 @@ impl Exit {
 
     /// The path and the request, if the device is to leave.
     pub fn asked(&self) -> Option<(ReentryPath, BootRequest)> {
-        let told = self.request.load(Ordering::Acquire);
-        let path = (told as u8).checked_sub(1).and_then(ReentryPath::from_number)?;
+        let reported = self.request.load(Ordering::Acquire);
+        let path = (reported as u8).checked_sub(1).and_then(ReentryPath::from_number)?;
         let argument = self.argument.load(Ordering::Relaxed);
-        Some((path, WarmStart::encode(told >> 8, argument).request().unwrap_or(BootRequest::Stay)))
+        Some((path, WarmStart::encode(reported >> 8, argument).request().unwrap_or(BootRequest::Stay)))
     }
 }
 

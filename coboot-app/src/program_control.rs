@@ -23,7 +23,7 @@ use shared_abi::warm_start::{BootRequest, Owed, StoredNode};
 use crate::abort::Abort;
 use crate::bootloader::{Bootloader, Confirmed, Services, LOCKED, NO_NODE_ID};
 use crate::departure::{Departure, Next};
-use crate::rules::{react, Command, Reaction, Standing};
+use crate::rules::{react, Command, Reaction, State};
 use crate::start::Start;
 
 /// 1F51h: program control.
@@ -296,8 +296,8 @@ impl ProgramControl {
         }
         let answers = self.bootloader_node.filter(|node| expedited && self.node_id == Some(*node));
         let Self { fresh, armed, .. } = *self;
-        let standing = Standing { fresh, armed, can_hand_over: answers.is_some() };
-        let reaction = react(command, sub == self.program, standing)?;
+        let state = State { fresh, armed, can_hand_over: answers.is_some() };
+        let reaction = react(command, sub == self.program, state)?;
         let leaves = matches!(reaction, Reaction::CallBack | Reaction::Restart | Reaction::HandOver);
         if leaves && !self.permits() {
             return Err(self.refuse(services));

@@ -42,7 +42,7 @@ impl Command {
 
 /// The state of an application when a command comes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Standing {
+pub struct State {
     /// It was started right after its download in one sequence, and no master has written 80h
     /// since.
     pub fresh: bool,
@@ -73,10 +73,10 @@ pub enum Reaction {
 ///
 /// # Errors
 /// [`Abort::DEVICE_STATE`] for what is the bootloader's to do: it has to be called first.
-pub const fn react(command: Command, own: bool, standing: Standing) -> Result<Reaction, Abort> {
+pub const fn react(command: Command, own: bool, state: State) -> Result<Reaction, Abort> {
     use Command::{Clear, ClearSignature, Reset, SetSignature, Start, StartBootloader, Stop};
 
-    let Standing { fresh, armed, can_hand_over } = standing;
+    let State { fresh, armed, can_hand_over } = state;
     Ok(match command {
         // Masters that do not know SYS TEC's commands confirm by it what they have just started.
         StartBootloader if own && fresh && !armed => Reaction::Confirm,
@@ -98,11 +98,11 @@ mod tests {
     use super::*;
     use Reaction::{CallBack, Confirm, HandOver, Nothing, Restart};
 
-    const PLAIN: Standing = Standing { fresh: false, armed: false, can_hand_over: true };
+    const PLAIN: State = State { fresh: false, armed: false, can_hand_over: true };
     const REFUSED: Result<Reaction, Abort> = Err(Abort(0x0800_0022));
 
-    fn reaction(value: u8, own: bool, standing: Standing) -> Result<Reaction, Abort> {
-        react(Command::from_value(value).unwrap(), own, standing)
+    fn reaction(value: u8, own: bool, state: State) -> Result<Reaction, Abort> {
+        react(Command::from_value(value).unwrap(), own, state)
     }
 
     /// Commands by their value (SYS TEC manual L-1112d_10, table 2), of the program that runs and of
@@ -121,7 +121,7 @@ mod tests {
             assert_eq!(reaction(value, true, PLAIN), own, "{value:02X}h");
             assert_eq!(reaction(value, false, PLAIN), other, "{value:02X}h of another program");
             // A fresh program takes one of them differently, and that of its own sub-index alone.
-            let fresh = Standing { fresh: true, ..PLAIN };
+            let fresh = State { fresh: true, ..PLAIN };
             let expected = if value == 0x80 { Ok(Confirm) } else { own };
             assert_eq!(reaction(value, true, fresh), expected, "{value:02X}h, fresh");
             assert_eq!(reaction(value, false, fresh), other, "{value:02X}h of another program, fresh");
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn a_password_makes_every_way_back_one_into_the_bootloader() {
-        let armed = Standing { armed: true, fresh: true, ..PLAIN };
+        let armed = State { armed: true, fresh: true, ..PLAIN };
         assert_eq!(reaction(0x80, true, armed), Ok(CallBack));
         assert_eq!(reaction(0x02, true, armed), Ok(CallBack));
         assert_eq!(reaction(0x02, false, armed), Ok(CallBack));
@@ -139,7 +139,7 @@ mod tests {
     /// STOP is a call back then. CLEAR would be acknowledged by somebody who cannot carry it out.
     #[test]
     fn without_a_bootloader_that_answers_clear_is_refused() {
-        let alone = Standing { can_hand_over: false, ..PLAIN };
+        let alone = State { can_hand_over: false, ..PLAIN };
         assert_eq!(reaction(0x00, true, alone), Ok(CallBack));
         assert_eq!(reaction(0x03, true, alone), REFUSED);
         assert_eq!(reaction(0x03, false, alone), REFUSED);

@@ -32,7 +32,7 @@ pub struct Start {
     /// first 1F51h = 80h confirms it.
     pub fresh: bool,
     /// All values of the bootloader; `None` if no bootloader started the program.
-    pub told: Option<BootInfo>,
+    pub reported: Option<BootInfo>,
 }
 
 impl Start {
@@ -41,21 +41,21 @@ impl Start {
     pub fn read(layout: &Layout, defaults: Defaults) -> Self {
         // SAFETY: the layout's handoff region, which `Layout::checked` holds to be RAM of that size
         // and which the linker scripts keep out of every image.
-        let told = unsafe { Handoff::read(layout.handoff.base as usize as *const Handoff) };
-        Self::new(told, defaults)
+        let reported = unsafe { Handoff::read(layout.handoff.base as usize as *const Handoff) };
+        Self::new(reported, defaults)
     }
 
     /// From what the bootloader passed on, if it did.
     #[must_use]
-    pub const fn new(told: Option<BootInfo>, defaults: Defaults) -> Self {
-        match told {
+    pub const fn new(reported: Option<BootInfo>, defaults: Defaults) -> Self {
+        match reported {
             Some(info) => Self {
                 node_id: Some(info.node_id),
                 bit_rate: info.bit_rate,
                 serial_number: info.serial_number,
                 program: info.program,
                 fresh: info.fresh,
-                told,
+                reported,
             },
             None => Self {
                 node_id: defaults.node_id,
@@ -63,7 +63,7 @@ impl Start {
                 serial_number: defaults.serial_number,
                 program: 1,
                 fresh: false,
-                told,
+                reported,
             },
         }
     }
@@ -72,8 +72,8 @@ impl Start {
     /// CAN, or no bootloader started the program.
     #[must_use]
     pub const fn bootloader_number(&self) -> Option<u8> {
-        match self.told {
-            Some(told) => told.bootloader_number,
+        match self.reported {
+            Some(reported) => reported.bootloader_number,
             None => None,
         }
     }
@@ -82,8 +82,8 @@ impl Start {
     /// Those of the predefined connection set if no bootloader started the program.
     #[must_use]
     pub const fn sdo(&self) -> SdoBases {
-        match self.told {
-            Some(told) => told.sdo,
+        match self.reported {
+            Some(reported) => reported.sdo,
             None => SdoBases::PREDEFINED,
         }
     }
@@ -93,8 +93,8 @@ impl Start {
     /// label has a date, or no bootloader started the program.
     #[must_use]
     pub const fn software_date(&self) -> [u32; 2] {
-        match self.told {
-            Some(told) => days_and_milliseconds(told.program_date),
+        match self.reported {
+            Some(reported) => days_and_milliseconds(reported.program_date),
             None => [0; 2],
         }
     }
@@ -104,7 +104,7 @@ impl Start {
     /// The serial number in use is [`serial_number`](Self::serial_number).
     #[must_use]
     pub fn nameplate(&self) -> Option<Nameplate> {
-        self.told.filter(|told| told.nameplate)?;
+        self.reported.filter(|reported| reported.nameplate)?;
         // SAFETY: the bootloader has read it there: the program runs on a chip with these bytes.
         unsafe { Nameplate::read(OTP.base as usize as *const Words) }
     }
@@ -145,13 +145,13 @@ mod tests {
 
     #[test]
     fn what_the_bootloader_told_comes_before_the_defaults() {
-        let Start { node_id, bit_rate, serial_number, program, fresh, told } =
+        let Start { node_id, bit_rate, serial_number, program, fresh, reported } =
             Start::new(Some(TOLD), DEFAULTS);
         assert_eq!((node_id, bit_rate, serial_number, program), (Some(5), 500_000, 9, 2));
-        assert!(fresh && told == Some(TOLD));
+        assert!(fresh && reported == Some(TOLD));
         let start = Start::new(None, DEFAULTS);
         assert_eq!((start.node_id, start.bit_rate, start.serial_number), (Some(32), 125_000, 7));
-        assert_eq!((start.program, start.fresh, start.told), (1, false, None));
+        assert_eq!((start.program, start.fresh, start.reported), (1, false, None));
         assert_eq!(start.sdo(), SdoBases { request: 0x600, response: 0x580 });
         assert_eq!(Start::new(Some(TOLD), DEFAULTS).sdo(), TOLD.sdo);
         assert_eq!(start.software_date(), [0, 0]);

@@ -254,9 +254,9 @@ mod tests {
     #[test]
     fn fields_lie_where_the_manual_puts_them() {
         let header = [1, 0, 0, 0, 0x00, 0x00, 0x01, 0x08, 0x10, 0, 0, 0];
-        let told = Header { number: 1, flash_address: 0x0801_0000, size: 16 };
-        assert_eq!(Header::parse(&header), told);
-        assert_eq!(told.emit(), header);
+        let reported = Header { number: 1, flash_address: 0x0801_0000, size: 16 };
+        assert_eq!(Header::parse(&header), reported);
+        assert_eq!(reported.emit(), header);
 
         // Block 0 of the manual's example call: --vid 0 --pid 1234 --ver 0x00640A01 (V1.10r100).
         #[rustfmt::skip]
@@ -267,20 +267,20 @@ mod tests {
             0x01, 0x0A, 0x64, 0x00,
             0x80, 0x51, 0x01, 0, 0, 0, 0, 0,
         ];
-        let told = Control::Dated {
+        let reported = Control::Dated {
             identity: Identity { app_size: 0, vendor_id: 0, product_code: 1234 },
             version: 0x0064_0A01,
             date: 86400,
         };
-        assert_eq!(Control::parse(&control), Some(told));
-        assert_eq!(told.emit(), (control, 24));
+        assert_eq!(Control::parse(&control), Some(reported));
+        assert_eq!(reported.emit(), (control, 24));
 
         let last = [0x00, 0x10, 0, 0, 0x26, 0x39, 0xF4, 0xCB];
-        let told = Last { program_size: 4096, program_crc: 0xCBF4_3926 };
-        assert_eq!(Last::parse(&last), Some(told));
-        assert_eq!(told.emit(), last);
+        let reported = Last { program_size: 4096, program_crc: 0xCBF4_3926 };
+        assert_eq!(Last::parse(&last), Some(reported));
+        assert_eq!(reported.emit(), last);
         // With the 32 reserved bytes of 2008 in front, and with other lengths.
-        for (reserved, expected) in [(32, Some(told)), (31, None), (33, None), (4, None), (248, None)] {
+        for (reserved, expected) in [(32, Some(reported)), (31, None), (33, None), (4, None), (248, None)] {
             let old = [&[0xA5; 248][..reserved], &last[..]].concat();
             assert_eq!(Last::parse(&old), expected, "{reserved}");
         }
@@ -291,9 +291,9 @@ mod tests {
     fn a_date_has_64_bits() {
         let mut control = [0; 24];
         control[16..].copy_from_slice(&[0x04, 0x03, 0x02, 0x01, 0x08, 0x07, 0x06, 0x05]);
-        let Some(told @ Control::Dated { date, .. }) = Control::parse(&control) else { panic!() };
+        let Some(reported @ Control::Dated { date, .. }) = Control::parse(&control) else { panic!() };
         assert_eq!(date, 0x0506_0708_0102_0304);
-        assert_eq!(told.emit(), (control, 24));
+        assert_eq!(reported.emit(), (control, 24));
     }
 
     #[test]

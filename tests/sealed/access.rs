@@ -63,7 +63,7 @@ fn rights_add_up_and_end_with_the_power() {
 /// 2002h/3: the roots, and what an image must have at least, as it was at the reset.
 #[test]
 fn roots_epoch_and_counter_are_told() {
-    fn told(host: &mut Host<'_>) -> Vec<u32> {
+    fn reported(host: &mut Host<'_>) -> Vec<u32> {
         let mut bytes = [0; 64];
         let len = host.node.read(Address::new(0x2002, 3), &mut bytes).unwrap();
         bytes[..len].chunks(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
@@ -71,19 +71,19 @@ fn roots_epoch_and_counter_are_told() {
     let roots = [&keys().root, &keys().second_root].map(|root| root.public().id());
     let device = Device::sealed(&STANDARD_1);
     let before = device.run(|host| {
-        let told = told(host);
-        assert_eq!((&told[..2], told.len()), (&roots[..], 4));
+        let reported = reported(host);
+        assert_eq!((&reported[..2], reported.len()), (&roots[..], 4));
         host.install(1, &sealed(1, 5, 1));
-        told
+        reported
     });
     assert!(before[3] < 5, "{before:X?}");
     device.run(|host| {
-        let told = told(host);
-        assert_eq!((&told[..2], told[3]), (&roots[..], 5));
-        assert!(told[2] >= before[2]);
+        let reported = reported(host);
+        assert_eq!((&reported[..2], reported[3]), (&roots[..], 5));
+        assert!(reported[2] >= before[2]);
     });
     // Without keys there are no roots.
-    Device::open(&STANDARD_1).run(|host| assert_eq!(told(host)[..3], [0; 3]));
+    Device::open(&STANDARD_1).run(|host| assert_eq!(reported(host)[..3], [0; 3]));
 }
 
 #[test]

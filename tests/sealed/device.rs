@@ -199,13 +199,13 @@ fn without_keys_the_device_is_open() {
 #[test]
 fn the_demonstration_succeeds() {
     let output = Command::new(env!("CARGO_BIN_EXE_demo")).arg("--sealed").output().unwrap();
-    let told = [output.stdout, output.stderr].concat();
-    let told = String::from_utf8_lossy(&told);
-    assert!(output.status.success(), "{told}");
+    let reported = [output.stdout, output.stderr].concat();
+    let reported = String::from_utf8_lossy(&reported);
+    assert!(output.status.success(), "{reported}");
     for line in ["1F57h = 8Ah", "1F57h = 8Ch", "1F57h = 8Eh", "1F57h = 84h"] {
-        assert!(told.contains(line), "no {line:?} in:\n{told}");
+        assert!(reported.contains(line), "no {line:?} in:\n{reported}");
     }
-    assert_eq!(told.matches("the old program starts").count(), 5, "{told}");
+    assert_eq!(reported.matches("the old program starts").count(), 5, "{reported}");
 }
 
 /// Destructive actions need the root key: they are requested by 2002h, permitted until the next
@@ -249,8 +249,8 @@ fn the_holder_of_the_root_key_gets_rights_and_the_device_remembers() {
     bench.power_cycle();
     bench.await_boot_up(100);
     assert_eq!(challenge(&mut bench.session()).unwrap().granted(), 0, "until the reset");
-    let told: Vec<u32> = events(&mut bench.session()).unwrap().iter().map(|event| event.what).collect();
-    assert_eq!(told, [event::UNLOCKED | right::ERASE, event::INSTALLED | 1]);
+    let reported: Vec<u32> = events(&mut bench.session()).unwrap().iter().map(|event| event.what).collect();
+    assert_eq!(reported, [event::UNLOCKED | right::ERASE, event::INSTALLED | 1]);
 }
 
 /// The holder of the root key can open the device permanently: from the next reset on, it accepts

@@ -51,16 +51,16 @@ fn a_good_image_of_every_form_is_installed() {
                 let file = seal(&Sealer { chunk, ..sealer(form) }, &image);
                 let piece = pieces[number % pieces.len()];
                 number += 1;
-                let told = format!("{form:?}, chunks of 2^{chunk}, {size} bytes, {piece} at a time");
+                let reported = format!("{form:?}, chunks of 2^{chunk}, {size} bytes, {piece} at a time");
                 let device = Device::sealed(&STANDARD_1);
                 device.run(|host| {
-                    assert_eq!(host.update(1, &file, piece), (Ok(()), 0), "{told}");
+                    assert_eq!(host.update(1, &file, piece), (Ok(()), 0), "{reported}");
                     // The size in the manifest.
-                    assert_eq!(host.identification(1).to_le_bytes(), file[32..36], "{told}");
+                    assert_eq!(host.identification(1).to_le_bytes(), file[32..36], "{reported}");
                     is_installed(host, 1, &image);
                 });
-                assert_eq!(device.starts(None), Some(1), "{told}");
-                assert_eq!(device.counter(1), 5, "{told}");
+                assert_eq!(device.starts(None), Some(1), "{reported}");
+                assert_eq!(device.counter(1), 5, "{reported}");
             }
         }
     }
@@ -589,11 +589,11 @@ fn nothing_that_comes_in_between_gets_past_the_signature() {
         host.install(1, &of(1, &old));
         host.install(2, &strange);
     });
-    let check = |right: bool, between: Between, at: usize, steps: u32, told: &str| {
+    let check = |right: bool, between: Between, at: usize, steps: u32, reported: &str| {
         let device = before.copy();
         device.run(|host| {
             if right {
-                assert!(host.grant(&keys().root, 0x1B, 0), "{told}");
+                assert!(host.grant(&keys().root, 0x1B, 0), "{reported}");
             }
             host.clear(1);
             let mut sent = host.begin(1, &file[..at], 7);
@@ -609,22 +609,22 @@ fn nothing_that_comes_in_between_gets_past_the_signature() {
             host.settle();
             host.node.take_boot_request();
             let whole = device.holds(1, &new);
-            assert!(whole || device.holds(1, &old) || device.record(1).is_none(), "{told}");
-            assert!(sent.is_err() || whole || host.status(1) != 0, "{told}");
-            assert!(device.holds(2, &other), "{told}");
+            assert!(whole || device.holds(1, &old) || device.record(1).is_none(), "{reported}");
+            assert!(sent.is_err() || whole || host.status(1) != 0, "{reported}");
+            assert!(device.holds(2, &other), "{reported}");
             for touched in device.take_touched() {
-                assert!(region.contains(touched.base, touched.size), "{told}: {touched:?}");
+                assert!(region.contains(touched.base, touched.size), "{reported}: {touched:?}");
             }
         });
-        device.run(|host| assert_eq!(host.update(1, &file, 7), (Ok(()), 0), "{told}"));
-        assert!(device.holds(1, &new), "{told}");
+        device.run(|host| assert_eq!(host.update(1, &file, 7), (Ok(()), 0), "{reported}"));
+        assert!(device.holds(1, &new), "{reported}");
     };
     for right in [false, true] {
         for (what, between) in BETWEEN {
             for at in (0..=file.len()).step_by(60) {
                 for steps in [0, 3, 40, u32::MAX] {
-                    let told = format!("{what} after {at} bytes and {steps} steps, rights: {right}");
-                    check(right, between, at, steps, &told);
+                    let reported = format!("{what} after {at} bytes and {steps} steps, rights: {right}");
+                    check(right, between, at, steps, &reported);
                 }
             }
         }

@@ -35,37 +35,37 @@ fn next(form: (bool, bool), len: usize) -> (Vec<u8>, Vec<u8>) {
 }
 
 /// Checks a refusal with one of these codes, without any loss.
-fn costs_nothing(device: &Device, old: &[u8], file: &[u8], codes: &[u32], told: &str) {
+fn costs_nothing(device: &Device, old: &[u8], file: &[u8], codes: &[u32], reported: &str) {
     device.run(|host| {
         let (abort, status) = host.update(1, file, 7);
-        assert!(codes.contains(&status), "{told}: {status:02X}h, and not {codes:02X?}");
-        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{told}: {abort:?}");
-        assert_eq!(device.take_touched(), [], "{told}");
-        assert_eq!(host.start(1), Some(1), "{told}: the old program can be started");
+        assert!(codes.contains(&status), "{reported}: {status:02X}h, and not {codes:02X?}");
+        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{reported}: {abort:?}");
+        assert_eq!(device.take_touched(), [], "{reported}");
+        assert_eq!(host.start(1), Some(1), "{reported}: the old program can be started");
     });
-    assert!(device.holds(1, old), "{told}");
+    assert!(device.holds(1, old), "{reported}");
 }
 
 /// Checks a refusal after good signatures: there is no program, only `authentic` bytes of it are in
 /// the flash, and a valid image can be installed.
-fn costs_the_program(device: &Device, file: &[u8], codes: &[u32], authentic: &[u8], told: &str) {
+fn costs_the_program(device: &Device, file: &[u8], codes: &[u32], authentic: &[u8], reported: &str) {
     let device = device.copy();
     device.run(|host| {
         let (abort, status) = host.update(1, file, 7);
-        assert!(codes.contains(&status), "{told}: {status:02X}h, and not {codes:02X?}");
-        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{told}: {abort:?}");
-        assert_eq!(host.state(1), 3, "{told}: there is none");
-        assert_eq!(host.start(1), None, "{told}");
+        assert!(codes.contains(&status), "{reported}: {status:02X}h, and not {codes:02X?}");
+        assert!(abort.is_ok() || abort == Err(AbortCode::STORE), "{reported}: {abort:?}");
+        assert_eq!(host.state(1), 3, "{reported}: there is none");
+        assert_eq!(host.start(1), None, "{reported}");
     });
-    assert!(device.record(1).is_none() && device.starts(None).is_none(), "{told}");
+    assert!(device.record(1).is_none() && device.starts(None).is_none(), "{reported}");
     let written = device.cells(1, authentic.len());
-    assert_eq!(written, authentic, "{told}");
+    assert_eq!(written, authentic, "{reported}");
     let size = STANDARD_1.region(1).size as usize;
     let sector = authentic.len().next_multiple_of(0x400).min(size);
-    assert!(device.cells(1, sector)[authentic.len()..].iter().all(|byte| *byte == 0xFF), "{told}");
+    assert!(device.cells(1, sector)[authentic.len()..].iter().all(|byte| *byte == 0xFF), "{reported}");
     let (good, image) = next((true, true), 700);
     device.run(|host| host.install(1, &good));
-    assert!(device.holds(1, &image), "{told}");
+    assert!(device.holds(1, &image), "{reported}");
 }
 
 // --- bits
@@ -152,8 +152,8 @@ fn every_bit_of_the_head_counts() {
             for bit in 0..8 {
                 let mut file = good.clone();
                 file[at] ^= 1 << bit;
-                let told = format!("{form:?} bit {bit} of byte {at}");
-                costs_nothing(&device, &old, &file, &code_of_flip(&good, at, bit), &told);
+                let reported = format!("{form:?} bit {bit} of byte {at}");
+                costs_nothing(&device, &old, &file, &code_of_flip(&good, at, bit), &reported);
             }
         }
         device.run(|host| host.install(1, &good));
@@ -176,21 +176,21 @@ fn every_byte_of_the_chunks_counts() {
             }
             let mut file = good.clone();
             file[at] ^= 1 << random.below(8);
-            let told = format!("{form:?} byte {within} of chunk {chunk}");
+            let reported = format!("{form:?} byte {within} of chunk {chunk}");
             if chunk == 0 {
-                costs_nothing(&device, &old, &file, &[SIGNATURE], &told);
+                costs_nothing(&device, &old, &file, &[SIGNATURE], &reported);
             } else if form.1 {
                 // The size of a decompressed chunk, from an independent decoder.
                 let device = device.copy();
-                device.run(|host| assert_eq!(host.update(1, &file, 7).1, SIGNATURE, "{told}"));
-                assert!(device.record(1).is_none(), "{told}");
+                device.run(|host| assert_eq!(host.update(1, &file, 7).1, SIGNATURE, "{reported}"));
+                assert!(device.record(1).is_none(), "{reported}");
                 let size = STANDARD_1.region(1).size as usize;
                 let written = device.cells(1, image.len());
                 let same = written.iter().zip(&image).take_while(|(a, b)| a == b).count();
-                assert!(written[same..].iter().all(|byte| *byte == 0xFF), "{told}");
+                assert!(written[same..].iter().all(|byte| *byte == 0xFF), "{reported}");
                 assert!(same < size);
             } else {
-                costs_the_program(&device, &file, &[SIGNATURE], &image[..chunk * 512], &told);
+                costs_the_program(&device, &file, &[SIGNATURE], &image[..chunk * 512], &reported);
             }
         }
     }

@@ -362,8 +362,8 @@ fn a_key_that_is_revoked_signs_for_no_program() {
             }
             device.run(|host| {
                 for program in [other, first] {
-                    let (_, told) = host.update(program, &of_epoch(program, 5, 0x32), 7);
-                    assert_eq!(told, status::ROLLBACK, "{}: {program} behind {first}", setup.name);
+                    let (_, reported) = host.update(program, &of_epoch(program, 5, 0x32), 7);
+                    assert_eq!(reported, status::ROLLBACK, "{}: {program} behind {first}", setup.name);
                     host.install(program, &of_epoch(program, 6, 0x33));
                 }
             });

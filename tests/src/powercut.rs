@@ -22,12 +22,12 @@ use emulator::machine::{Cells, Cut, Operation};
 
 use crate::bench::Bench;
 use crate::firmware;
-use look::{look, observe};
+use observe::{observe, switched_on};
 use story::BOOT_MS;
 use story::SCENARIOS;
-pub use story::{scenarios, Outcome, Scenario, Seen, Story};
+pub use story::{scenarios, Observation, Outcome, Scenario, Story};
 
-mod look;
+mod observe;
 pub mod story;
 
 /// The number of looks at a flash with bits between 0 and 1: they read differently each time.
@@ -139,11 +139,11 @@ impl Proof<'_> {
     }
 
     /// Looks at a state, as often as it takes.
-    fn inspect(&self, bench: &mut Bench, cells: &Cells) -> Result<Seen, String> {
+    fn inspect(&self, bench: &mut Bench, cells: &Cells) -> Result<Observation, String> {
         let looks = if cells.unstable.is_empty() { 1 } else { LOOKS };
         let mut seen = self.story.from;
         for _ in 0..looks {
-            seen = look(self.story, bench, cells)?;
+            seen = switched_on(self.story, bench, cells)?;
             let Story { from, to, between, .. } = self.story;
             let outcomes = [&[from.outcome, to.outcome][..], between].concat();
             let known = [from, to].iter().any(|end| end.bootloader == seen.bootloader)
@@ -155,13 +155,13 @@ impl Proof<'_> {
         Ok(seen)
     }
 
-    fn count(&self, point: Point, found: Result<Seen, String>) {
+    fn count(&self, point: Point, found: Result<Observation, String>) {
         let mut total = self.total();
         let report = &mut total.1;
         let letter = match &found {
-            Ok(Seen { outcome: Outcome::Bootloader, .. }) => b'B',
-            Ok(Seen { outcome: Outcome::Old, .. }) => b'O',
-            Ok(Seen { outcome: Outcome::New, .. }) => b'N',
+            Ok(Observation { outcome: Outcome::Bootloader, .. }) => b'B',
+            Ok(Observation { outcome: Outcome::Old, .. }) => b'O',
+            Ok(Observation { outcome: Outcome::New, .. }) => b'N',
             Err(_) => b'!',
         };
         if point.second.is_none() || letter == b'!' {
@@ -301,7 +301,7 @@ fn tell(point: Point) -> Result<String, String> {
             return Err(format!("there is no operation {}, {} are all", at.operation, operations.len()));
         };
         cells = behind;
-        let seen = look(&story, &mut bench, &cells)?;
+        let seen = switched_on(&story, &mut bench, &cells)?;
         text += &format!(
             "cut at operation {} of {} ({}): {}, node {}\n",
             at.operation,

@@ -10,8 +10,9 @@ fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
     for scenario in scenarios() {
         let report = run(scenario, Effort::SAMPLE).expect("it works without a cut");
         println!("{}: {report:?}", scenario.name);
-        let told: Vec<_> = report.told.iter().map(|(point, what)| format!("{point}: {what}")).collect();
-        assert_eq!(report.violations, 0, "{}:\n{}", scenario.name, told.join("\n"));
+        let reported: Vec<_> =
+            report.reported.iter().map(|(point, what)| format!("{point}: {what}")).collect();
+        assert_eq!(report.violations, 0, "{}:\n{}", scenario.name, reported.join("\n"));
         assert!(report.operations > 0 && report.recoveries > 0, "{report:?}");
         if scenario.name == "update" {
             // Nothing lost yet, something lost, and all complete: the sample has met each state.
@@ -38,11 +39,11 @@ fn a_cut_shows_an_order_of_operations_that_is_wrong() {
     };
     // The ends and nothing else.
     let effort = Effort { cut: (20, usize::MAX), recovered: (0, usize::MAX), cut_again: (0, usize::MAX) };
-    let told = |operations: &[Operation]| {
+    let reported = |operations: &[Operation]| {
         let report = prove("update", &story, operations, effort);
-        report.told.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
+        report.reported.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
     };
-    assert_eq!(told(&sound), Vec::<String>::new());
+    assert_eq!(reported(&sound), Vec::<String>::new());
 
     // The record of the new program before its last words.
     let last_data = sound.iter().rposition(|operation| !is_parameter(operation)).unwrap();
@@ -54,8 +55,8 @@ fn a_cut_shows_an_order_of_operations_that_is_wrong() {
     let mut late = sound.clone();
     late[..=erase].rotate_right(1);
     for wrong in [early, late] {
-        let told = told(&wrong);
-        assert!(told.iter().any(|what| what.contains("is not what it says")), "{told:?}");
+        let reported = reported(&wrong);
+        assert!(reported.iter().any(|what| what.contains("is not what it says")), "{reported:?}");
     }
 }
 
@@ -85,13 +86,13 @@ fn a_cut_shows_a_home_that_is_erased_too_early() {
         story.start.apply(operation, board.chip, Cut::After);
     }
     let effort = Effort { cut: (usize::MAX / 2, 1), recovered: (0, usize::MAX), cut_again: (0, usize::MAX) };
-    let told = |operations: &[Operation]| {
+    let reported = |operations: &[Operation]| {
         let report = prove("renewal", &story, operations, effort);
-        report.told.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
+        report.reported.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
     };
     let mut records = sound[from..=erase].to_vec();
-    assert_eq!(told(&records), Vec::<String>::new());
+    assert_eq!(reported(&records), Vec::<String>::new());
     records.rotate_right(1);
-    let told = told(&records);
-    assert!(told.iter().any(|what| what.contains("bootloader does not answer")), "{told:?}");
+    let reported = reported(&records);
+    assert!(reported.iter().any(|what| what.contains("bootloader does not answer")), "{reported:?}");
 }

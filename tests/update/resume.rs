@@ -181,29 +181,33 @@ fn cut_updates(rate: BitRate, file: &Program, seeds: std::ops::Range<u64>) -> us
         bench.run_ms(random.below(3000) as u64);
 
         let second = update(&mut bench, file, None);
-        let told = format!("update {seed}, {way:?}: {:?}", second.events);
-        second.result.as_ref().unwrap_or_else(|error| panic!("{error}, {told}"));
-        assert!(!second.began_again(), "{told}");
+        let reported = format!("update {seed}, {way:?}: {:?}", second.events);
+        second.result.as_ref().unwrap_or_else(|error| panic!("{error}, {reported}"));
+        assert!(!second.began_again(), "{reported}");
         // Nothing is on record before the first step, and a program that is complete comes
         // once more as a whole, or not at all.
         if in_flash > step(file) && first.arrived() < file.size() as usize {
-            assert!(first.result.is_err(), "{told}");
-            let done = second.went_on().unwrap_or_else(|| panic!("from the start, {told}"));
+            assert!(first.result.is_err(), "{reported}");
+            let done = second.went_on().unwrap_or_else(|| panic!("from the start, {reported}"));
             going_on += 1;
             // With the power the device loses what waits in RAM for the flash.
             let waited = match way {
                 Way::Power(_) => first.arrived().saturating_sub(in_flash),
                 Way::Host(_) | Way::Bus(_) => 0,
             };
-            assert!(done + step(file) >= first.arrived() - waited, "{done} of {}, {told}", first.arrived());
+            assert!(
+                done + step(file) >= first.arrived() - waited,
+                "{done} of {}, {reported}",
+                first.arrived()
+            );
             let twice = first.sent + second.sent - uncut.sent;
             let limit = uncut.sent / 10 + waited / 6;
             println!("{rate:?} {way:?}: {twice} of {} frames twice, {waited} bytes waited", uncut.sent);
-            assert!(twice <= limit, "{twice} of {} frames, {told}", uncut.sent);
+            assert!(twice <= limit, "{twice} of {} frames, {reported}", uncut.sent);
         }
-        assert!(!bench.is_bootloader(NODE), "{told}");
+        assert!(!bench.is_bootloader(NODE), "{reported}");
         let crc = bench.session().read_number(Address::new(PROGRAM_ID, 1)).unwrap();
-        assert_eq!(crc, file.crc(), "{told}");
+        assert_eq!(crc, file.crc(), "{reported}");
         bench.assert_nothing_unmodelled();
     }
     going_on

@@ -120,7 +120,7 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
 
     let bus = board.bus.as_str();
     let failing = "sh -c 'test {state} = never'";
-    for (words, told) in [
+    for (words, reported) in [
         (vec!["--bus", bus, "--probe", "no-such-probe {elf}"], "\"no-such-probe\" is not there"),
         (vec!["--bus", bus, "--probe", "true", "--strap-command", "true"], "--strap-command needs {state}"),
         (vec!["--bus", bus, "--probe", "true", "--elf", "none.elf"], "--elf none.elf: there is no such file"),
@@ -131,6 +131,6 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
         (vec!["--probe", "true"], "--bus is missing"),
     ] {
         let (good, said) = hil(&words);
-        assert!(!good && said.contains(told), "{words:?}: {said}");
+        assert!(!good && said.contains(reported), "{words:?}: {said}");
     }
 }

@@ -196,8 +196,8 @@ fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs
     }
     let signed = if selector == Selector::Unconfirm { record.signed } else { confirmed };
     if record.signed != signed || record.confirmed != confirmed {
-        let told = ProgramRecord { signed, confirmed, ..record };
-        keep(&mut parameters, flash, Key::program(number), told.value())?;
+        let reported = ProgramRecord { signed, confirmed, ..record };
+        keep(&mut parameters, flash, Key::program(number), reported.value())?;
     }
     if confirmed && crash_count(&parameters, flash) > 0 {
         keep(&mut parameters, flash, Key::CRASH_COUNT, [0; 4])?;

@@ -29,7 +29,7 @@ impl Shown {
 
     /// The news in an event of an update of this node.
     pub(super) fn news(&self, node: NodeId, event: &Event) -> Vec<News> {
-        let failed = self.0.lock().unwrap_or_else(PoisonError::into_inner).told(wall(), node, event);
+        let failed = self.0.lock().unwrap_or_else(PoisonError::into_inner).record(wall(), node, event);
         let mut news = news_of(event);
         news.extend(failed.map(News::Failed));
         news

@@ -177,7 +177,7 @@ pub(super) fn event(node: NodeId, event: &Event) {
         line["time"] = stamp(wall()).into();
         report.events.line(&line.to_string());
         let mut histories = report.histories.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(update) = histories.told(wall(), node, event) {
+        if let Some(update) = histories.record(wall(), node, event) {
             report.failed(json!(update));
         }
     }

@@ -172,9 +172,9 @@ fn whole(b: &mut Bench<'_>, crc: bool, block_size: u8) -> Result<(), Stop> {
         let unused = usize::from(end[0] >> 2 & 7);
         got.truncate(got.len() - unused);
         ensure!(got == expected, "{got:02X?} in place of {expected:02X?}");
-        let told = u16::from_le_bytes([end[1], end[2]]);
+        let reported = u16::from_le_bytes([end[1], end[2]]);
         let right = Crc::<u16>::new(&CRC_16_XMODEM).checksum(&got);
-        ensure!(!crc || !sends_crc || told == right, "CRC {told:04X}h in place of {right:04X}h");
+        ensure!(!crc || !sends_crc || reported == right, "CRC {reported:04X}h in place of {right:04X}h");
     }
     b.send_sdo([0xA1, 0, 0, 0, 0, 0, 0, 0])?;
     b.works()

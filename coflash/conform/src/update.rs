@@ -171,8 +171,8 @@ fn running(b: &mut Bench<'_>) -> Result<(), Stop> {
 fn has_image(b: &mut Bench<'_>) -> Result<(), Stop> {
     let crcs = b.image()?.crcs();
     match b.with(|session| session.read_number(Address::new(PROGRAM_ID, NUMBER)))? {
-        told if crcs.contains(&told) => Ok(()),
-        told => failed(format!("1F56h/1 is {told:08X}h in place of {:08X}h", crcs[0])),
+        reported if crcs.contains(&reported) => Ok(()),
+        reported => failed(format!("1F56h/1 is {reported:08X}h in place of {:08X}h", crcs[0])),
     }
 }
 

@@ -81,7 +81,7 @@ impl Frames {
 
     /// Remembers an event of an update; gives what the device has shown if its update has failed.
     pub(super) fn record(&mut self, node: NodeId, event: &Event) -> Option<FailedUpdate> {
-        self.histories.told(wall(), node, event)
+        self.histories.record(wall(), node, event)
     }
 
     /// The frames after this one, oldest first.

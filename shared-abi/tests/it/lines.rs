@@ -61,8 +61,8 @@ fn peripherals_are_those_of_the_manuals() {
         (&[Line::F469, Line::F479], 2, 11, 93),
     ] {
         for line in lines {
-            let told = (line.can_controllers(), line.ports(), line.interrupts());
-            assert_eq!(told, (can, ports, interrupts), "{}", line.name());
+            let reported = (line.can_controllers(), line.ports(), line.interrupts());
+            assert_eq!(reported, (can, ports, interrupts), "{}", line.name());
             // The PAC ends with SPI6, position 86, on these two.
             let pac = if matches!(line, Line::F427 | Line::F437) { 87 } else { interrupts };
             assert_eq!(line.pac_interrupts(), pac, "{}", line.name());

@@ -16,7 +16,7 @@ use kit::rig::{
 use seal::access::right;
 use shared_abi::geometry::Region;
 
-use crate::device::{Action, Device, Holder, Program, Seen, Stored, Trouble};
+use crate::device::{Action, Device, Holder, Observation, Program, Stored, Trouble};
 use crate::files::{file, Content, Extent, Flaw, Part, Sent, NEW, NEWEST};
 use crate::mistakes::Mistake;
 use crate::model::Model;
@@ -123,7 +123,7 @@ pub struct Report {
     /// The number of points with a violation.
     pub violations: u64,
     /// The first of them: the point and the violation.
-    pub told: Vec<(Point, String)>,
+    pub reported: Vec<(Point, String)>,
 }
 
 impl Report {
@@ -133,8 +133,8 @@ impl Report {
             Ok(outcome) => *self.outcomes.entry(outcome).or_default() += 1,
             Err(what) => {
                 self.violations += 1;
-                if self.told.len() < TOLD {
-                    self.told.push((point, what));
+                if self.reported.len() < TOLD {
+                    self.reported.push((point, what));
                 }
             }
         }
@@ -146,8 +146,8 @@ impl Report {
             *self.outcomes.entry(outcome).or_default() += count;
         }
         self.violations += other.violations;
-        self.told.extend(other.told);
-        self.told.truncate(TOLD);
+        self.reported.extend(other.reported);
+        self.reported.truncate(TOLD);
     }
 }
 
@@ -576,7 +576,7 @@ impl Proof<'_> {
     fn start(&self) -> Result<State, String> {
         let Scenario { setup, stores, before, .. } = *self.scenario;
         let mut flash = Model::new(setup, 0, 0).flash();
-        let history = History::new(setup, self.model(&flash).look());
+        let history = History::new(setup, self.model(&flash).observe());
         let before = [before(setup), vec![Action::Settle, Action::PowerOff]].concat();
         let (model, trace) = self.play(&flash, &history, &before)?;
         flash = model.flash();
@@ -605,7 +605,7 @@ impl Proof<'_> {
                 continue;
             }
             trace.steps.push(Step { action, before: history.clone() });
-            let (answer, seen) = carried_out(|| (model.act(&action), model.look()))?;
+            let (answer, seen) = carried_out(|| (model.act(&action), model.observe()))?;
             if let Err(abort) = answer {
                 trace.refused.push(format!("{action:?}: {abort}"));
             }
@@ -627,7 +627,7 @@ impl Proof<'_> {
             if model.is_cut() {
                 let mut history = before.clone();
                 history.note(action, answer);
-                return self.look(model, history);
+                return self.observe(model, history);
             }
         }
         Err("there is no such operation".into())
@@ -635,13 +635,13 @@ impl Proof<'_> {
 
     /// What is found after a cut, several times. With the first cut nothing is excused by bits
     /// between 0 and 1.
-    fn look(&self, mut model: Model, mut history: History) -> Result<State, String> {
-        let mut seen = carried_out(|| model.look())?;
-        for look in 0..LOOKS {
-            if look > 0 {
+    fn observe(&self, mut model: Model, mut history: History) -> Result<State, String> {
+        let mut seen = carried_out(|| model.observe())?;
+        for observe in 0..LOOKS {
+            if observe > 0 {
                 seen = carried_out(|| {
                     let _ = model.act(&Action::PowerOff);
-                    model.look()
+                    model.observe()
                 })?;
             }
             let is_certain = seen.is_certain;
@@ -654,7 +654,7 @@ impl Proof<'_> {
         Ok(State { flash: model.flash(), history, outcome })
     }
 
-    fn outcome(&self, before: &Seen, seen: &Seen) -> &'static str {
+    fn outcome(&self, before: &Observation, seen: &Observation) -> &'static str {
         let End(new, ..) = self.scenario.end;
         let (was, program) = (&before.programs[0], &seen.programs[0]);
         let of = |content| file(self.scenario.setup, content).crc;
@@ -681,7 +681,7 @@ impl Proof<'_> {
         }
     }
 
-    fn ends(&self, seen: &Seen) -> bool {
+    fn ends(&self, seen: &Observation) -> bool {
         let Scenario { setup, end: End(first, second, starts, nodes), .. } = *self.scenario;
         let counts_late = setup.config.download.seal.counter_with_confirmation;
         let is = |(program, content): (&Program, Option<Content>)| match content {
@@ -780,7 +780,7 @@ impl Proof<'_> {
 }
 
 /// The first broken rule, if there is one.
-fn kept(history: &History, seen: &Seen) -> Result<(), String> {
+fn kept(history: &History, seen: &Observation) -> Result<(), String> {
     broken(history, seen).map_or(Ok(()), |rule| Err(format!("not true that {}: {seen:X?}", rule.name)))
 }
 
@@ -816,7 +816,7 @@ pub enum Shown {
 pub fn shows(scenario: &Scenario, mistake: Mistake) -> Shown {
     match (Proof { scenario, mistake: Some(mistake) }).run(Cuts::EveryOperation, 1) {
         Err(what) => Shown::Uncut(what),
-        Ok(report) => match report.told.into_iter().next() {
+        Ok(report) => match report.reported.into_iter().next() {
             Some((point, what)) => Shown::ByCut(point, what),
             None => Shown::No,
         },

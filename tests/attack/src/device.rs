@@ -136,7 +136,7 @@ pub struct Partial {
 
 /// A device as a debug probe finds it, if it were reset now, and as it tells it.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct Observation {
     /// The resets so far.
     pub starts: u32,
     /// Where the running bootloader was loaded from.
@@ -172,7 +172,7 @@ pub struct Seen {
     pub is_certain: bool,
 }
 
-impl Seen {
+impl Observation {
     pub fn state(&self) -> State {
         self.record.map_or(State::None, |record| record.state)
     }
@@ -194,5 +194,5 @@ pub trait Device {
     /// The abort with which the device has refused it; general error if the power was cut in it.
     fn act(&mut self, action: &Action) -> Result<(), AbortCode>;
     /// As a probe finds it. It changes nothing of it.
-    fn look(&mut self) -> Seen;
+    fn observe(&mut self) -> Observation;
 }

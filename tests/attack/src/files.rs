@@ -387,8 +387,8 @@ fn make(setup: &Setup, content: Content) -> File {
     let whole = if setup.takes_sealed { sealed(setup, number, content, &plain) } else { plain.clone() };
     let (size, sum) = (whole.len() as u32, crc32(&whole));
     let is_told = !matches!(content, Content::Image(_) | Content::Program(_, Extent::Untold));
-    let told = if is_told { size } else { 0 };
-    let mut blocks = vec![block(0, 0, &words(&[told, VENDOR_ID, PRODUCT_CODE]))];
+    let reported = if is_told { size } else { 0 };
+    let mut blocks = vec![block(0, 0, &words(&[reported, VENDOR_ID, PRODUCT_CODE]))];
     for (n, data) in (0..).zip(whole.chunks(chunk)) {
         blocks.push(block(1 + n, base + n * chunk as u32, data));
     }

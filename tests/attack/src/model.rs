@@ -19,7 +19,7 @@ use shared_abi::layout::Layout;
 use shared_abi::renewal::{Origin, Progress, State};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use crate::device::{Action, Device, Holder, Partial, Program, Seen, Stored, Trouble};
+use crate::device::{Action, Device, Holder, Observation, Partial, Program, Stored, Trouble};
 use crate::files::{file, OLD};
 use crate::mistakes::{Mistake, Store};
 use crate::sealed::{default_keys, keys, request};
@@ -333,7 +333,7 @@ impl Model {
 
     /// One place rots where another image is certain.
     fn rot(&mut self, at: usize, bits: u8) {
-        let seen = self.look();
+        let seen = self.observe();
         let place = match (seen.state(), seen.origin) {
             (State::Installed, Origin::Home) if seen.is_staged && at.is_multiple_of(2) => HOME,
             (State::Staged, Origin::Home | Origin::Trial) | (State::Installed, Origin::Home) => STAGING,
@@ -371,7 +371,7 @@ impl Device for Model {
         })
     }
 
-    fn look(&mut self) -> Seen {
+    fn observe(&mut self) -> Observation {
         let setup = self.setup;
         let origin = renews(setup).then(|| Progress::from_bytes(self.rig.word(0x2007, 9).to_le_bytes()));
         let origin = origin.map_or(Origin::Home, |progress| progress.expect("known numbers").origin);
@@ -414,7 +414,7 @@ impl Device for Model {
             Exit::Bootloader { .. } | Exit::Again | Exit::Choose => None,
         };
         let staged = check(&flash, PLACES.staging, layout, host);
-        Seen {
+        Observation {
             starts: self.starts,
             origin,
             loads: loads(&flash, layout, host, None).map(|(header, ..)| header.crc),

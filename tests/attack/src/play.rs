@@ -52,11 +52,12 @@ impl<D: Device> Attack<'_, D> {
             let actions = script::renewal(&self.history.seen, self.device.setup(), *image);
             return self.act_all(&actions).map(Ok);
         }
-        let (answer, seen) = caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
-            let text = cause.downcast_ref::<String>().map(String::as_str);
-            let text = text.or(cause.downcast_ref::<&str>().copied());
-            Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
-        })?;
+        let (answer, seen) =
+            caught(|| (self.device.act(action), self.device.observe())).map_err(|cause| {
+                let text = cause.downcast_ref::<String>().map(String::as_str);
+                let text = text.or(cause.downcast_ref::<&str>().copied());
+                Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
+            })?;
         self.met.refused += u64::from(answer.is_err());
         self.history.note(action, answer);
         if let Some(rule) = broken(&self.history, &seen) {
@@ -150,7 +151,7 @@ pub fn act<'m, D: Device>(
     actions: &[Action],
     met: &'m mut Met,
 ) -> Result<Attack<'m, D>, (usize, Broken)> {
-    let history = History::new(device.setup(), device.look());
+    let history = History::new(device.setup(), device.observe());
     let mut attack = Attack { device, history, met };
     for (n, action) in actions.iter().enumerate() {
         attack.act_all(&[*action]).map_err(|broken| (n, broken))?;

@@ -11,7 +11,7 @@ use seal::access::right;
 use shared_abi::renewal::{Origin, State};
 use shared_abi::warm_start::BootRequest;
 
-use crate::device::{Action, Holder, Partial, Program, Seen, Stored, Trouble};
+use crate::device::{Action, Holder, Observation, Partial, Program, Stored, Trouble};
 use crate::files::{counter_of_image, file, may_run, Content, Flaw, Part, Sent};
 
 /// What was before an action, and the action with its answer.
@@ -21,7 +21,7 @@ pub struct History {
     action: Action,
     answer: Result<(), AbortCode>,
     /// The device then.
-    pub seen: Seen,
+    pub seen: Observation,
     /// The programs, number 1 first: whether this one may be lost since CLEAR or data were accepted.
     may_go: Vec<bool>,
     /// The image in staging has decayed since it was stored.
@@ -61,7 +61,7 @@ pub struct History {
 }
 
 impl History {
-    pub(crate) fn new(setup: &'static Setup, seen: Seen) -> Self {
+    pub(crate) fn new(setup: &'static Setup, seen: Observation) -> Self {
         Self {
             setup,
             action: Action::Settle,
@@ -179,7 +179,7 @@ impl History {
         }
     }
 
-    pub(crate) fn update(&mut self, seen: Seen) {
+    pub(crate) fn update(&mut self, seen: Observation) {
         self.rotten &= seen.record.is_some();
         let is_reset = seen.starts != self.seen.starts;
         let counters: Vec<_> =
@@ -225,7 +225,7 @@ impl History {
 /// What is true after each action.
 pub struct Rule {
     pub name: &'static str,
-    pub is_kept: fn(before: &History, now: &Seen) -> bool,
+    pub is_kept: fn(before: &History, now: &Observation) -> bool,
 }
 
 pub const RULES: &[Rule] = &[
@@ -255,7 +255,7 @@ pub const RULES: &[Rule] = &[
 ];
 
 /// The first rule that is broken.
-pub fn broken(before: &History, now: &Seen) -> Option<&'static Rule> {
+pub fn broken(before: &History, now: &Observation) -> Option<&'static Rule> {
     RULES.iter().find(|rule| !(rule.is_kept)(before, now))
 }
 
@@ -274,12 +274,12 @@ const ABORTS: [u32; 31] = [
     0x060A_0023, 0x0800_0000, 0x0800_0020, 0x0800_0021, 0x0800_0022, 0x0800_0023, 0x0800_0024,
 ];
 
-fn loads(before: &History, now: &Seen) -> bool {
+fn loads(before: &History, now: &Observation) -> bool {
     let renews = before.setup.profile.extras.bootloader.is_some();
     !renews || now.loads.is_some_and(|crc| may_run(before.setup, crc))
 }
 
-fn keeps_confirmed(before: &History, now: &Seen) -> bool {
+fn keeps_confirmed(before: &History, now: &Observation) -> bool {
     let was = &before.seen;
     let Some(record) = was.record.filter(|record| record.state == State::Confirmed) else { return true };
     // The resident part has loaded home all the same: the record is void.
@@ -289,12 +289,12 @@ fn keeps_confirmed(before: &History, now: &Seen) -> bool {
     now.record == Some(record) || is_installed || is_void || !is_certain
 }
 
-fn records_are_true(before: &History, now: &Seen) -> bool {
+fn records_are_true(before: &History, now: &Observation) -> bool {
     let is_true = now.record.is_none() || now.is_staged || before.rotten || !now.is_certain;
     is_true && now.programs.iter().all(|program| program.stored != Stored::Damaged)
 }
 
-fn keeps_programs(before: &History, now: &Seen) -> bool {
+fn keeps_programs(before: &History, now: &Observation) -> bool {
     let was = &before.seen;
     let mut programs = was.programs.iter().zip(&now.programs).zip(&before.may_go);
     let is_certain = was.is_certain && now.is_certain;
@@ -304,7 +304,7 @@ fn keeps_programs(before: &History, now: &Seen) -> bool {
         })
 }
 
-fn tells_the_truth(before: &History, now: &Seen) -> bool {
+fn tells_the_truth(before: &History, now: &Observation) -> bool {
     let read_back = match before.action {
         Action::Upload { sub } => now.read_back.zip(now.program(sub)),
         _ => None,
@@ -318,7 +318,7 @@ fn tells_the_truth(before: &History, now: &Seen) -> bool {
         && read_back.is_none_or(|(crc, program)| crc == program.crc)
 }
 
-fn touches_the_named(before: &History, now: &Seen) -> bool {
+fn touches_the_named(before: &History, now: &Observation) -> bool {
     let (setup, layout) = (before.setup, before.setup.layout);
     let named = before.named.iter().filter(|sub| setup.has(**sub)).map(|sub| setup.region(*sub));
     // A renewal goes on after a reset, and what takes its place ends it.
@@ -329,7 +329,7 @@ fn touches_the_named(before: &History, now: &Seen) -> bool {
     now.touched.iter().all(|at| places.iter().any(|place| place.contains(at.base, at.size)))
 }
 
-fn others_stay(before: &History, now: &Seen) -> bool {
+fn others_stay(before: &History, now: &Observation) -> bool {
     // A record with bits between 0 and 1 reads as it likes, and its data are checked by other rules.
     let mut programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
     let last = before.nodes.last().filter(|_| before.stores && now.is_idle && now.is_stored);
@@ -340,7 +340,7 @@ fn others_stay(before: &History, now: &Seen) -> bool {
         && last.is_none_or(|last| *last == now.node)
 }
 
-fn starts_what_was_asked(before: &History, now: &Seen) -> bool {
+fn starts_what_was_asked(before: &History, now: &Observation) -> bool {
     use BootRequest::{Fresh, Renewal, Start, Trial};
     let waits = before.started.filter(|_| now.is_idle).and_then(|started| now.program(started));
     let Some(request) = now.request else { return waits.is_none_or(|program| program.status != 0) };
@@ -355,7 +355,7 @@ fn starts_what_was_asked(before: &History, now: &Seen) -> bool {
         && !before.setup.is_data(number)
 }
 
-fn has_defined_values(before: &History, now: &Seen) -> bool {
+fn has_defined_values(before: &History, now: &Observation) -> bool {
     let has_password = |sub| before.setup.password(sub).is_some();
     let is_wrong = match before.action {
         Action::Password { sub, is_right: false } => has_password(sub),
@@ -371,15 +371,15 @@ fn has_defined_values(before: &History, now: &Seen) -> bool {
         && now.programs.iter().all(is_defined)
 }
 
-fn ends(_: &History, now: &Seen) -> bool {
+fn ends(_: &History, now: &Observation) -> bool {
     !now.is_idle || now.programs.iter().all(|program| program.status & 1 == 0)
 }
 
-fn starts_the_whole(_: &History, now: &Seen) -> bool {
+fn starts_the_whole(_: &History, now: &Observation) -> bool {
     now.starting.is_none_or(|(_, is_whole)| is_whole)
 }
 
-fn releases(before: &History, now: &Seen) -> bool {
+fn releases(before: &History, now: &Observation) -> bool {
     let is_signed = |program: &Program| program.record.is_some_and(|record| record.signed);
     let is_certain = before.seen.is_certain && now.is_certain;
     let mut programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
@@ -387,12 +387,12 @@ fn releases(before: &History, now: &Seen) -> bool {
     !is_certain || programs.all(|(number, (was, now))| !is_signed(now) || is_signed(was) || may_be(number))
 }
 
-fn is_locked(before: &History, _: &Seen) -> bool {
+fn is_locked(before: &History, _: &Observation) -> bool {
     let Action::Send { sub, .. } = before.action else { return true };
     before.answer.is_err() || !before.setup.profile.download.locked || before.unlocked.contains(&sub)
 }
 
-fn goes_on(before: &History, now: &Seen) -> bool {
+fn goes_on(before: &History, now: &Observation) -> bool {
     (1..).zip(&now.programs).all(|(number, program)| {
         let Some(Partial { id, len, crc }) = program.partial else { return true };
         let begun = before.begun.iter().find(|(of, _)| *of == number).and_then(|(_, begun)| *begun);
@@ -404,12 +404,12 @@ fn goes_on(before: &History, now: &Seen) -> bool {
     })
 }
 
-fn is_sealed(before: &History, now: &Seen) -> bool {
+fn is_sealed(before: &History, now: &Observation) -> bool {
     let is_sealed = |program: &Program| program.record.is_none_or(|record| record.is_sealed());
     !before.setup.takes_sealed || now.programs.iter().all(is_sealed)
 }
 
-fn counts(before: &History, now: &Seen) -> bool {
+fn counts(before: &History, now: &Observation) -> bool {
     let is_certain = before.seen.is_certain && now.is_certain;
     !is_certain || before.seen.programs.iter().zip(&now.programs).all(|(was, now)| now.counter >= was.counter)
 }
@@ -421,14 +421,14 @@ fn counter_of(before: &History, number: u8, program: &Program) -> u32 {
     sent.map(|(.., counter)| *counter).min().unwrap_or(0)
 }
 
-fn is_counted(before: &History, now: &Seen) -> bool {
+fn is_counted(before: &History, now: &Observation) -> bool {
     before.setup.config.download.seal.counter_with_confirmation
         || (1..)
             .zip(&now.programs)
             .all(|(number, program)| program.counter >= counter_of(before, number, program))
 }
 
-fn follows(before: &History, now: &Seen) -> bool {
+fn follows(before: &History, now: &Observation) -> bool {
     let is_certain = before.seen.is_certain && now.is_certain;
     let programs = (1..).zip(before.seen.programs.iter().zip(&now.programs));
     !is_certain
@@ -438,7 +438,7 @@ fn follows(before: &History, now: &Seen) -> bool {
 }
 
 /// Two genuine bootloaders cannot be exchanged for ever.
-fn follows_home(before: &History, now: &Seen) -> bool {
+fn follows_home(before: &History, now: &Observation) -> bool {
     let (setup, was) = (before.setup, &before.seen);
     let is_certain = was.is_certain && now.is_certain && !before.is_spoilt;
     let is_new = |crc: &u32| was.record.map(|record| record.crc) != Some(*crc);
@@ -448,7 +448,7 @@ fn follows_home(before: &History, now: &Seen) -> bool {
     !setup.takes_sealed || !is_certain || staged.zip(was.home).is_none_or(follows)
 }
 
-fn waits(before: &History, now: &Seen) -> bool {
+fn waits(before: &History, now: &Observation) -> bool {
     let is_certain = before.seen.is_certain && now.is_certain && !before.is_spoilt;
     let with_confirmation = before.setup.config.download.seal.counter_with_confirmation;
     let mut programs = (1..).zip(&now.programs).zip(&before.may_be_proved);

@@ -8,7 +8,7 @@ use kit::rig::{crc32, Setup};
 use seal::access::right;
 use shared_abi::renewal::{Origin, State};
 
-use crate::device::{Action, Holder, Seen, Trouble};
+use crate::device::{Action, Holder, Observation, Trouble};
 use crate::files::{file, free, Changes, Content, Extent, Flaw, Part, Sent, RELEASES};
 
 /// Commands of 1F51h.
@@ -301,7 +301,7 @@ pub(crate) fn whole(setup: &'static Setup, sub: u8, content: Content) -> Vec<Act
 }
 
 /// What a tool does next so that this image becomes the bootloader. It has given the password.
-pub(crate) fn renewal(seen: &Seen, setup: &'static Setup, image: Content) -> Vec<Action> {
+pub(crate) fn renewal(seen: &Observation, setup: &'static Setup, image: Content) -> Vec<Action> {
     let sub = setup.profile.extras.bootloader.expect("it can be renewed");
     let wanted = Some(file(setup, image).crc);
     let is_ready = seen.is_staged && seen.record.map(|record| record.crc) == wanted;

@@ -21,7 +21,7 @@ fn prove(cuts: Cuts) -> u64 {
             }
         };
         println!("{name}: {} operations, {} points, {:?}", report.operations, report.points, report.outcomes);
-        wrong.extend(report.told.iter().map(|(point, what)| format!("{point}: {what}")));
+        wrong.extend(report.reported.iter().map(|(point, what)| format!("{point}: {what}")));
         points += report.points;
         // An update leaves nothing of the old program, or all of it; or the new one. The sample has too
         // few points of a sealed one to meet each.
@@ -57,7 +57,7 @@ fn nor_while_the_journal_changes_over() {
     for (seed, scenario) in (0..).zip(all.filter(Scenario::changes_over)) {
         changed += 1;
         let report = run(&scenario, Cuts::Sample(seed)).expect("it works without a cut");
-        assert_eq!(report.told, [], "{seed}");
+        assert_eq!(report.reported, [], "{seed}");
     }
     assert!(changed > 2, "{changed}");
 }

@@ -36,14 +36,17 @@ fn attacks(setups: impl IntoIterator<Item = &'static Setup>, seeds: u64, kinds: 
             let new = || Model::new(setup, buffer, stores);
             let Err(failure) = attack(new, seed, &mut met) else { continue };
             // One for each rule.
-            if failures.iter().all(|(name, told)| (*name, told.broken.0) != (setup.name, failure.broken.0)) {
+            if failures
+                .iter()
+                .all(|(name, reported)| (*name, reported.broken.0) != (setup.name, failure.broken.0))
+            {
                 failures.push((setup.name, failure));
             }
         }
         println!("{}: {} attacks, {} lives", setup.name, seeds.end - seeds.start, met.lives - before);
     }
-    let told: Vec<_> = failures.iter().map(|(setup, failure)| format!("{setup}, {failure}")).collect();
-    assert!(told.is_empty(), "{} rules:\n{}", told.len(), told.join("\n"));
+    let reported: Vec<_> = failures.iter().map(|(setup, failure)| format!("{setup}, {failure}")).collect();
+    assert!(reported.is_empty(), "{} rules:\n{}", reported.len(), reported.join("\n"));
     met
 }
 

@@ -165,10 +165,10 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut means = Means::of(Duration::from_millis(if flags & 2 != 0 { 50 } else { 1000 }));
     means.image = (flags & 4 != 0).then(program);
     let cancelled = Arc::new(AtomicBool::new(false));
-    let mut told = 0;
-    let verdicts = run(&mut hostile, node(), &checks[first..last], means, &cancelled, &mut |_| told += 1)
+    let mut reported = 0;
+    let verdicts = run(&mut hostile, node(), &checks[first..last], means, &cancelled, &mut |_| reported += 1)
         .expect("the bus is there");
-    assert_eq!((verdicts.len(), told), (last - first, last - first));
+    assert_eq!((verdicts.len(), reported), (last - first, last - first));
     for verdict in verdicts {
         if let Outcome::Failed(words) | Outcome::Skipped(words) = verdict.outcome {
             assert!(!words.is_empty(), "{}", verdict.check.id);

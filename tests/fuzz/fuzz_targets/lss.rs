@@ -95,8 +95,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     assert_eq!(device.stored, Some((NodeId::new(0x2A), Some(BitRate::K500))));
     for (i, part) in (0_u8..).zip(PARTS) {
         let [a, b, c, d] = part.to_le_bytes();
-        let told = Some([0x5A + i, a, b, c, d, 0, 0, 0]);
-        ask(&mut lss, &mut device, now, [0x5A + i, 0, 0, 0, 0, 0, 0, 0], told);
+        let reported = Some([0x5A + i, a, b, c, d, 0, 0, 0]);
+        ask(&mut lss, &mut device, now, [0x5A + i, 0, 0, 0, 0, 0, 0, 0], reported);
     }
     assert_eq!(lss.reset_communication(), NodeId::new(0x2A));
 });

@@ -31,9 +31,9 @@ pub fn replay(target: impl Fn(&[u8])) -> std::process::ExitCode {
                 eprintln!("{} cannot be read.", file.display());
                 return std::process::ExitCode::FAILURE;
             };
-            let told = Told(&file);
+            let reported = Told(&file);
             target(&bytes);
-            std::mem::forget(told);
+            std::mem::forget(reported);
             count += 1;
         }
     }

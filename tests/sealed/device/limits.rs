@@ -40,10 +40,10 @@ fn board_at(rate: BitRate) -> Bench {
 /// Sends a file in segments as fast as they are answered, and then reads 1000h and 1F57h in turn
 /// until the device is idle; `look` gets the board between the latter requests. Returns the word of
 /// 1F57h.
-fn send_and_ask(bench: &mut Bench, file: &[u8], look: &mut dyn FnMut(&Bench)) -> u32 {
+fn send_and_ask(bench: &mut Bench, file: &[u8], observe: &mut dyn FnMut(&Bench)) -> u32 {
     send(bench, file, usize::MAX);
     loop {
-        look(bench);
+        observe(bench);
         assert_eq!(request(bench, READ_1000)[4..], [0, 0, 0, 0x10]);
         let word = status_word(bench);
         if word & 1 == 0 {
@@ -324,23 +324,23 @@ fn no_secret_outlives_its_use() {
     let mut bench = board_at(BitRate::K1000);
     assert!(of_all.are_in(bench.machine().flash()), "it is found where it is");
     let mut looks = 0;
-    let mut look = |bench: &Bench| {
+    let mut observe = |bench: &Bench| {
         assert!(!of_all.are_left(bench), "look {looks}");
         looks += 1;
     };
-    assert_eq!(send_and_ask(&mut bench, &file, &mut look), status::OK);
+    assert_eq!(send_and_ask(&mut bench, &file, &mut observe), status::OK);
     assert!(looks >= 2);
     let mut left = Vec::new();
-    let mut look = |bench: &mut Bench, what: &'static str| {
+    let mut observe = |bench: &mut Bench, what: &'static str| {
         let found = [&of_all, &of_file, &of_other].map(|traces| traces.are_left(bench));
         if found.contains(&true) {
             left.push((what, found));
         }
     };
-    look(&mut bench, "after the installation");
+    observe(&mut bench, "after the installation");
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.run_to_first_instruction();
-    look(&mut bench, "at the start of the program");
+    observe(&mut bench, "at the start of the program");
     bench.await_boot_up(1_000);
     call_back(&mut bench);
 
@@ -350,7 +350,7 @@ fn no_secret_outlives_its_use() {
     assert!(of_file.are_left(&bench), "in use");
     bench.machine().reset_pin();
     bench.run_to_first_instruction();
-    look(&mut bench, "in a program after a reset in the middle");
+    observe(&mut bench, "in a program after a reset in the middle");
     bench.await_boot_up(1_000);
     call_back(&mut bench);
 
@@ -364,7 +364,7 @@ fn no_secret_outlives_its_use() {
             _ => bench.machine().reset_pin(),
         }
         bench.run_ms(2_000);
-        look(&mut bench, what);
+        observe(&mut bench, what);
     }
     // A second CLEAR without data needs a right.
     bench.machine().reset_pin();
@@ -373,6 +373,6 @@ fn no_secret_outlives_its_use() {
     *broken.last_mut().unwrap() ^= 1;
     let word = send_and_ask(&mut bench, &broken, &mut |_| {});
     assert_eq!(word, status::SIGNATURE);
-    look(&mut bench, "a refusal");
+    observe(&mut bench, "a refusal");
     assert!(left.is_empty(), "[secrets of all, of the first image, of the other one]: {left:#?}");
 }

@@ -177,7 +177,7 @@ pub struct Attack {
     /// A reset that was asked for may come until then.
     leaves_until: u64,
     /// The last frames and actions, for a report.
-    told: VecDeque<String>,
+    reported: VecDeque<String>,
     /// The counts.
     pub summary: Summary,
 }
@@ -210,7 +210,7 @@ impl Attack {
             was_disturbed: false,
             in_doubt: false,
             leaves_until: 0,
-            told: VecDeque::new(),
+            reported: VecDeque::new(),
             summary: Summary::default(),
         };
         attack.pass(100_000)?;
@@ -243,14 +243,14 @@ impl Attack {
     /// The last frames and actions.
     #[must_use]
     pub fn story(&self) -> String {
-        self.told.iter().map(|line| format!("  {line}\n")).collect()
+        self.reported.iter().map(|line| format!("  {line}\n")).collect()
     }
 
     fn tell(&mut self, line: String) {
-        if self.told.len() == TOLD {
-            self.told.pop_front();
+        if self.reported.len() == TOLD {
+            self.reported.pop_front();
         }
-        self.told.push_back(line);
+        self.reported.push_back(line);
     }
 
     // --- the bus

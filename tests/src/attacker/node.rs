@@ -129,12 +129,12 @@ impl Node {
         let Some(device) = &mut self.device else { return };
         let now = Instant::from_millis((self.now_us / 1000) as u32);
         let (at, events) = (self.now_us, &mut self.events);
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for steps in 0.. {
             assert!(steps < ENDLESS, "the work never ends");
             let mut send = |frame| events.push((at, Happened::Frame { by_device: true, frame }));
-            let more = device.work(now, &mut send, &mut |event| told.push(event));
-            for event in told.drain(..) {
+            let more = device.work(now, &mut send, &mut |event| reported.push(event));
+            for event in reported.drain(..) {
                 if !matches!(event, device::Event::NodeId(_)) {
                     self.result = Some(event);
                     events.push((at, Happened::Reset));

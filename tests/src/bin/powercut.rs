@@ -159,7 +159,7 @@ fn as_text(name: &str, report: &Report) -> String {
         "{name:<18} {:>10} {:>9} {:>8} {:>11} {bootloader:>12} {old:>12} {new:>12} {:>11}",
         report.operations, report.points, report.states, report.recoveries, report.violations
     );
-    for (point, what) in &report.told {
+    for (point, what) in &report.reported {
         text += &format!("\n  {point}: {what}");
     }
     text
@@ -167,7 +167,7 @@ fn as_text(name: &str, report: &Report) -> String {
 
 fn as_json(level: u8, name: &str, report: &Report) -> Value {
     let [bootloader, old, new] = outcomes(report);
-    let told: Vec<_> = report.told.iter().map(|(point, what)| format!("{point}: {what}")).collect();
+    let reported: Vec<_> = report.reported.iter().map(|(point, what)| format!("{point}: {what}")).collect();
     let map = report.map.iter().map(|(way, letters)| (*way, String::from_utf8_lossy(letters)));
     json!({
         "level": level,
@@ -180,7 +180,7 @@ fn as_json(level: u8, name: &str, report: &Report) -> Value {
         "old_program": old,
         "new_program": new,
         "violations": report.violations,
-        "told": told,
+        "told": reported,
         "map": map.collect::<BTreeMap<_, _>>(),
     })
 }

@@ -59,7 +59,7 @@ impl Outcome {
 
 /// What answers, and under which node-ID.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Seen {
+pub struct Observation {
     /// What answers.
     pub outcome: Outcome,
     /// The node-ID.
@@ -78,9 +78,9 @@ pub struct Story {
     /// The flash of the board before.
     pub start: Cells,
     /// What the board does before.
-    pub from: Seen,
+    pub from: Observation,
     /// What it does afterwards.
-    pub to: Seen,
+    pub to: Observation,
     /// What may answer after a cut besides.
     pub between: &'static [Outcome],
     /// Version 1 and version 2 as they lie in the program's flash.
@@ -237,8 +237,8 @@ fn from_version_1(
     Ok(Story {
         bootloader,
         start: bench.machine().flash_cells(),
-        from: Seen { outcome: Outcome::Old, node: NODE, bootloader: None },
-        to: Seen { outcome: Outcome::New, node: NODE, bootloader: None },
+        from: Observation { outcome: Outcome::Old, node: NODE, bootloader: None },
+        to: Observation { outcome: Outcome::New, node: NODE, bootloader: None },
         between: &[Outcome::Bootloader],
         programs: [program_of(firmware::APP_V1)?, program_of(firmware::APP_V2)?],
         act: Box::new(act),
@@ -304,7 +304,7 @@ fn control(bench: &mut Bench, command: ProgramControl) -> Result<(), String> {
 
 fn store() -> Result<Story, String> {
     let mut story = update(|_| Ok(()))?;
-    story.to = Seen { node: OTHER_NODE, ..story.from };
+    story.to = Observation { node: OTHER_NODE, ..story.from };
     story.between = &[];
     story.act = Box::new(|bench| {
         // Switch state global: configuration. Configure node-ID. Store (CiA 305). Then a reset.
@@ -330,7 +330,7 @@ fn renew_bootloader() -> Result<Story, String> {
         renewed.map(drop).map_err(|error| error.to_string())
     })?;
     story.from.bootloader = Some(OLD);
-    story.to = Seen { bootloader: Some(NEW), ..story.from };
+    story.to = Observation { bootloader: Some(NEW), ..story.from };
     story.between = &[];
     Ok(story)
 }

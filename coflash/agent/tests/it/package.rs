@@ -36,7 +36,7 @@ fn package(root: Option<&SigningKey>) -> Vec<u8> {
 
 /// Runs the agent with this target until there is nothing to do; returns what the server was told at the end,
 /// and what the devices were given.
-fn told(server: &Server, folder: &Folder, target: &str, action: Action) -> (String, Vec<(String, u32)>) {
+fn reported(server: &Server, folder: &Folder, target: &str, action: Action) -> (String, Vec<(String, u32)>) {
     std::fs::write(folder.join("root.pub"), key(1).public().to_pem()).unwrap();
     std::fs::write(folder.join("token"), format!("t-{ID}\n")).unwrap();
     let text = format!(
@@ -59,7 +59,7 @@ const DEVICE: &str = "[[device]]\nnode = 5";
 fn a_machine_gets_the_package_that_its_root_has_signed() {
     let (server, folder) = (Server::start(&[ID]), folder("package"));
     let artifact = File::new("press.cpk", &package(Some(&key(1))));
-    let (details, given) = told(&server, &folder, MACHINE, Action::new(1, &artifact));
+    let (details, given) = reported(&server, &folder, MACHINE, Action::new(1, &artifact));
     assert_eq!(given, [(ID.to_string(), crc())], "{details}");
     assert!(details.starts_with("success: "), "{details}");
 }
@@ -88,7 +88,7 @@ fn what_is_no_package_of_the_machine_is_refused_and_nothing_is_started() {
         (of(DEVICE, "press.cpk", PROGRAM), "this target is one device", "[[machine]]"),
     ];
     for (number, ((target, artifact), what, more)) in all.into_iter().enumerate() {
-        let (details, given) = told(&server, &folder, target, Action::new(number as u64, &artifact));
+        let (details, given) = reported(&server, &folder, target, Action::new(number as u64, &artifact));
         assert_eq!(given, [], "{number}: {details}");
         assert!(details.starts_with("failure: "), "{number}: {details}");
         for words in [what, more, "what to do: "] {
@@ -96,6 +96,6 @@ fn what_is_no_package_of_the_machine_is_refused_and_nothing_is_started() {
         }
     }
     // The device itself is served as before.
-    let (details, given) = told(&server, &folder, DEVICE, Action::new(100, &file()));
+    let (details, given) = reported(&server, &folder, DEVICE, Action::new(100, &file()));
     assert_eq!(given, [(ID.to_string(), crc())], "{details}");
 }

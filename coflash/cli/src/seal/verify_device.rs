@@ -42,11 +42,11 @@ impl VerifyDevice {
         let mut session = self.device.session(&mut link)?;
         let comparison =
             compare_sealed(&mut session, &file).map_err(|error| Failure::diagnosed(error, &mut session))?;
-        let Delivery { renewal, option_bytes, faults, untold: unknown, .. } =
+        let Delivery { renewal, option_bytes, faults, unanswered: unknown, .. } =
             delivery(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         let (node, program) = (session.node(), file.head().program());
-        let Comparison { running, runs, differences, untold, .. } = &comparison;
-        let untold = [&untold[..], &unknown].concat();
+        let Comparison { running, runs, differences, unanswered, .. } = &comparison;
+        let unanswered = [&unanswered[..], &unknown].concat();
         let which = format!("program {program} of {}", path.display());
         let verdict = match (comparison.is_same(), runs) {
             (true, true) => format!("runs {which}, according to its own answers"),
@@ -70,8 +70,8 @@ impl VerifyDevice {
             words +=
                 &format!("\n  protection   the device has {}; it needs {wanted}", sector_list(protected));
         }
-        if !untold.is_empty() {
-            let objects: Vec<String> = untold.iter().map(ToString::to_string).collect();
+        if !unanswered.is_empty() {
+            let objects: Vec<String> = unanswered.iter().map(ToString::to_string).collect();
             words += &format!("\n  not reported {}", objects.join(", "));
         }
         context.result(words, || {
@@ -89,7 +89,7 @@ impl VerifyDevice {
                 "renewal": renewal,
                 "option_bytes": option_bytes,
                 "protected": protected,
-                "untold": untold.iter().map(ToString::to_string).collect::<Vec<_>>(),
+                "unanswered": unanswered.iter().map(ToString::to_string).collect::<Vec<_>>(),
             })
         });
         match (comparison.is_same(), faults.is_empty()) {

@@ -335,6 +335,6 @@ fn a_failed_update_of_the_agent_is_in_its_report_too() {
     assert!(update["frames"].to_string().contains("  585#43571F0106000000  "), "{update:#}");
     assert!(update["answers"][0].as_str().unwrap().starts_with("1F57h reads 06h"), "{update:#}");
     assert!(!Firmware::new(&image).is_in(&bytes));
-    let told = server.action("door").details("closed");
-    assert!(told.contains("it answered: 1F57h reads 06h"), "{told}");
+    let reported = server.action("door").details("closed");
+    assert!(reported.contains("it answered: 1F57h reads 06h"), "{reported}");
 }

@@ -260,8 +260,8 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     coflash(&["flash", &file, "--blocks", "--block-size", "20"])
         .fails(2, &["a block size of 20 is impossible"]);
     // A device that does not report its program's start, and one that does not accept blocks.
-    let untold = Objects::sealed(program).but(((0x2004, 1), Vec::new()));
-    let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
+    let unanswered = Objects::sealed(program).but(((0x2004, 1), Vec::new()));
+    let (done, fake) = on(BOOTLOADER, unanswered, &["flash", &file, "--blocks"]);
     done.fails(6, &["the start of its program (2004h)"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     let words = ["flash", &file, "--blocks", "--dialect", "raw"];
@@ -350,8 +350,8 @@ fn a_device_is_compared_with_a_sealed_image() {
     let (done, _) = comparison.of(APPLICATION, Objects::sealed(&program()), &["--json"]);
     let value: Value = serde_json::from_str(&done.good().out).unwrap();
     assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
-    let untold = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
-    assert_eq!(value["untold"], untold);
+    let unanswered = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
+    assert_eq!(value["unanswered"], unanswered);
 
     // A program of which no installation is among the last eight events, and one of another number.
     let forgotten = same_device().but(event(2, [0; 4])).but(event(3, [7, 0x1_0002, 1, 1]));

@@ -307,9 +307,9 @@ impl coboot_can::Adapter for Chatter {
 fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     let mut slow = device(5, BOOTLOADER);
     // Each block takes some time, so that the signal comes in the middle.
-    let (told, heard) = std::sync::mpsc::channel();
+    let (reported, heard) = std::sync::mpsc::channel();
     slow.on_block = Box::new(move |block| {
-        let _ = told.send(block);
+        let _ = reported.send(block);
         std::thread::sleep(Duration::from_millis(if block == 1 { 300 } else { 0 }));
         Outcome::Accept
     });

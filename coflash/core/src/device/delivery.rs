@@ -25,7 +25,7 @@ pub struct Delivery {
     /// The reasons against its delivery.
     pub faults: Vec<Fault>,
     /// The objects that it does not report. An application has the number of its bootloader alone.
-    pub untold: Vec<Address>,
+    pub unanswered: Vec<Address>,
 }
 
 /// A reason against the delivery of a device. `Display` says what to do, too.
@@ -120,12 +120,12 @@ impl fmt::Display for Fault {
 /// # Errors
 /// Those of a [read](Session::read); an object that the device does not have is no error.
 pub fn delivery(session: &mut Session<'_>) -> Result<Delivery, Error> {
-    let (mut faults, mut untold) = (Vec::new(), Vec::new());
+    let (mut faults, mut unanswered) = (Vec::new(), Vec::new());
     let mut number = |sub| {
         let at = Address::new(DEVICE_STATE, sub);
         let value = reported(session.read_number(at))?;
         if value.is_none() {
-            untold.push(at);
+            unanswered.push(at);
         }
         Ok::<_, Error>(value)
     };
@@ -142,8 +142,8 @@ pub fn delivery(session: &mut Session<'_>) -> Result<Delivery, Error> {
         match reported(progress(session))?.flatten() {
             Some(progress) => faults.extend(Fault::of(progress)),
             // None, or a state of a later version.
-            None => untold.push(Address::new(DEVICE_STATE, STATE_RENEWAL)),
+            None => unanswered.push(Address::new(DEVICE_STATE, STATE_RENEWAL)),
         }
     }
-    Ok(Delivery { renewal, option_bytes, faults, untold })
+    Ok(Delivery { renewal, option_bytes, faults, unanswered })
 }

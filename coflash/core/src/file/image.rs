@@ -197,7 +197,7 @@ impl Image {
     #[must_use]
     pub fn bytes<const N: usize>(&self, address: u32) -> Option<[u8; N]> {
         let mut bytes = [0; N];
-        let mut told = 0;
+        let mut reported = 0;
         let end = u64::from(address) + N as u64;
         for piece in &self.pieces {
             let from = u64::from(piece.address);
@@ -206,10 +206,10 @@ impl Image {
                 let data = &piece.data[(first - from) as usize..(behind - from) as usize];
                 let at = (first - u64::from(address)) as usize;
                 bytes[at..at + data.len()].copy_from_slice(data);
-                told += data.len();
+                reported += data.len();
             }
         }
-        (told == N).then_some(bytes)
+        (reported == N).then_some(bytes)
     }
 
     /// The value of all bytes, if they are all equal.

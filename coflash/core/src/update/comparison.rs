@@ -32,7 +32,7 @@ pub struct Comparison {
     pub differences: Vec<Difference>,
     /// The objects that the device does not have, and that could therefore not be compared. An
     /// application may lack objects that the bootloader has.
-    pub untold: Vec<Address>,
+    pub unanswered: Vec<Address>,
 }
 
 /// A difference between device and file.
@@ -120,11 +120,11 @@ pub fn compare_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<Co
     let head = file.head();
     let program = head.program();
     let running = session.find()?;
-    let mut comparison = Comparison { running, runs: false, differences: Vec::new(), untold: Vec::new() };
+    let mut comparison = Comparison { running, runs: false, differences: Vec::new(), unanswered: Vec::new() };
     let mut number = |comparison: &mut Comparison, at: Address| -> Result<Option<u32>, Error> {
         let value = reported(session.read_number(at))?;
         if value.is_none() {
-            comparison.untold.push(at);
+            comparison.unanswered.push(at);
         }
         Ok(value)
     };
@@ -183,7 +183,7 @@ fn compare_access(
             let device = "has a bootloader without support for sealed images";
             comparison.differs(Part::Keys, "a signature to be checked", device);
         }
-        None => comparison.untold.push(Address::new(ACCESS, 1)),
+        None => comparison.unanswered.push(Address::new(ACCESS, 1)),
     }
     Ok(())
 }
@@ -205,7 +205,7 @@ fn compare_events(
                 .compare(Part::InstalledCounter, head.counter(), last.counter, |number| number.to_string());
             comparison.compare(Part::InstalledVersion, head.version(), last.version, release);
         }
-        None => comparison.untold.push(Address::new(EVENTS, 1)),
+        None => comparison.unanswered.push(Address::new(EVENTS, 1)),
     }
     Ok(())
 }

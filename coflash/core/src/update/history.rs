@@ -69,7 +69,7 @@ impl Histories {
     }
 
     /// Remembers an event of an update. At the end of one that has failed, this gives what it has shown.
-    pub fn told(&mut self, time: Duration, node: NodeId, event: &Event) -> Option<FailedUpdate> {
+    pub fn record(&mut self, time: Duration, node: NodeId, event: &Event) -> Option<FailedUpdate> {
         match event {
             Event::Progress { .. } => None,
             Event::Done(done) => {

@@ -75,8 +75,8 @@ fn the_first_number_tells_a_block() {
 fn only_the_last_block_may_be_longer_than_it_says() {
     let region = STANDARD_1.region(1);
     let image = raw(&STANDARD_1, 1, 64);
-    let old = |number: u32, address: u32, data: &[u8; 40], told: u32| {
-        let mut bytes = words(&[number, address, told]);
+    let old = |number: u32, address: u32, data: &[u8; 40], reported: u32| {
+        let mut bytes = words(&[number, address, reported]);
         bytes.extend(data);
         bytes.extend(crc32(&bytes).to_le_bytes());
         bytes
@@ -84,12 +84,12 @@ fn only_the_last_block_may_be_longer_than_it_says() {
     let mut last = [0; 40];
     last[32..36].copy_from_slice(&64_u32.to_le_bytes());
     last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
-    for (number, told, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
+    for (number, reported, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
         let mut rig = open(&STANDARD_1, 1024);
         rig.send(1, &block(1, region.base, &image)).unwrap();
         rig.settle();
-        let sent = rig.send(1, &old(number, region.base + 64, &last, told));
-        assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {told}");
+        let sent = rig.send(1, &old(number, region.base + 64, &last, reported));
+        assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {reported}");
         rig.settle();
         assert_eq!(rig.state(1), if good { 0 } else { 3 });
     }
@@ -130,14 +130,18 @@ fn a_record_stays_in_its_segment() {
 #[test]
 fn a_size_that_is_told_is_erased_ahead() {
     let image = raw(&STANDARD_1, 1, 0x3000);
-    for told in [true, false] {
+    for reported in [true, false] {
         let mut rig = Rig::new(&STANDARD_1, 8 * 1024);
         rig.install(1, &image);
         rig.clear(1);
         let next = raw(&STANDARD_1, 1, 0x2800);
-        rig.begin(1, told.then_some(next.len() as u32), &next[..1600]).unwrap();
+        rig.begin(1, reported.then_some(next.len() as u32), &next[..1600]).unwrap();
         rig.settle();
-        assert_eq!(rig.cells(1)[0x2000..0x2800].iter().all(|byte| *byte == 0xFF), told, "told: {told}");
+        assert_eq!(
+            rig.cells(1)[0x2000..0x2800].iter().all(|byte| *byte == 0xFF),
+            reported,
+            "told: {reported}"
+        );
     }
 }
 

@@ -284,12 +284,12 @@ fn a_program_whose_crc_or_vectors_are_wrong_is_no_program() {
     nowhere[4..8].copy_from_slice(&0x0800_0101_u32.to_le_bytes());
     // If the first block contains the vectors, they are checked with it, and it is refused. Here it
     // contains only the first vector.
-    for (stored, told) in [(&image, &other), (&nowhere, &nowhere)] {
+    for (stored, reported) in [(&image, &other), (&nowhere, &nowhere)] {
         let mut bench = Bench::cleared(new_flash());
         bench.good(&block(0, 0, &[0; 8]));
         bench.good(&block(1, PROGRAM.base, &stored[..4]));
         bench.good(&block(2, PROGRAM.base + 4, &stored[4..]));
-        assert_eq!(bench.block(&last(told)), (Ok(()), 0x02));
+        assert_eq!(bench.block(&last(reported)), (Ok(()), 0x02));
         assert_eq!(bench.word(IDENTIFICATION), block_crc(stored), "1F56h shows what is in flash");
         assert_eq!(bench.command(SET_SIGNATURE), 0x02);
         assert_eq!(bench.command(START), 0x02);
@@ -503,10 +503,10 @@ fn a_file_for_another_product_is_refused_before_anything_is_lost() {
     fn no_downgrade(program: u8, info: &AppInfo<'_>) -> Verdict {
         assert_eq!(program, 1);
         match info.control {
-            Some(Control::Identity(told)) if told.app_size == 0xBAD => {
+            Some(Control::Identity(reported)) if reported.app_size == 0xBAD => {
                 Verdict::Refuse(FlashError::Unspecified)
             }
-            Some(Control::Identity(told)) if told.app_size == 0x600D => Verdict::Accept,
+            Some(Control::Identity(reported)) if reported.app_size == 0x600D => Verdict::Accept,
             _ => Verdict::Standard,
         }
     }

@@ -142,7 +142,7 @@ fn date_and_time_are_those_of_block_0_or_of_the_label() {
     assert_eq!(date(&mut Bench::with_buffer(&mut flash, POLICY, 2048)), [0, 0], "no program");
     let leap_day = [5903, 43_200_000];
     let today = [15_671, 66_615_000];
-    for (image, told, expected) in [
+    for (image, reported, expected) in [
         (labelled(NEW, &label(LEAP_DAY)), 0, leap_day),
         (labelled(NEW, &label(LEAP_DAY)), TODAY.into(), today),
         (labelled(NEW, &label(0)), TODAY.into(), today),
@@ -158,13 +158,13 @@ fn date_and_time_are_those_of_block_0_or_of_the_label() {
     ] {
         let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
         assert_eq!(bench.command(CLEAR), 0);
-        bench.good(&control(told));
+        bench.good(&control(reported));
         block_file(&image, 512)[1..].iter().for_each(|block| bench.good(block));
-        assert_eq!(date(&mut bench), expected, "{told}");
+        assert_eq!(date(&mut bench), expected, "{reported}");
         assert_eq!(bench.command(SET_SIGNATURE), 0);
-        assert_eq!(date(&mut bench), expected, "{told}: released");
+        assert_eq!(date(&mut bench), expected, "{reported}: released");
         let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
-        assert_eq!(date(&mut bench), expected, "{told}: after a reset");
+        assert_eq!(date(&mut bench), expected, "{reported}: after a reset");
         assert_eq!(bench.node.write(Address::new(0x1F52, 1), &[0; 4]), Err(AbortCode(0x0601_0000)));
     }
     let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);

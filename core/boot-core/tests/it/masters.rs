@@ -184,7 +184,7 @@ fn meddle(world: &mut World<'_>, random: &mut Random) {
 }
 
 /// The checks when both masters are silent.
-fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
+fn observe(world: &mut World<'_>, seed: u64, random: &mut Random) {
     match random.below(4) {
         // A client that aborts the open transfer gets an answer at once.
         0 => {
@@ -239,7 +239,7 @@ fn two_masters_at_once_and_whatever_else_comes() {
                     break;
                 }
             }
-            look(&mut world, seed, &mut random);
+            observe(&mut world, seed, &mut random);
         }
         // A master that is alone with the device.
         world.put(&Frame::of(CobId::LSS_REQUEST, &[0x04, 0, 0, 0, 0, 0, 0, 0]));

@@ -267,7 +267,7 @@ fn progress_is_stored_each_kib_and_ends_with_the_program() {
         let mut flash = ModelFlash::new(&CHIP);
         let mut bench = Bench::new(&mut flash);
         bench.all_good(&file[..=sent]);
-        let told = partial(&mut bench);
+        let reported = partial(&mut bench);
         let stored = partial(&mut Bench::new(&mut flash));
         if sent == 0 || sent == end {
             assert_eq!(stored, (0, 0), "{sent} blocks");
@@ -275,7 +275,7 @@ fn progress_is_stored_each_kib_and_ends_with_the_program() {
             let kibs = sent * CHUNK / 1024 * 1024;
             assert_eq!(stored, (crc_of(&file[0]), PROGRAM.base + kibs as u32), "{sent} blocks");
         }
-        assert_eq!(told == (0, 0), sent == end, "{sent} blocks");
+        assert_eq!(reported == (0, 0), sent == end, "{sent} blocks");
     }
 }
 
@@ -360,9 +360,9 @@ fn a_refused_program_costs_nothing_however_often_it_comes() {
             for attempt in 0..4 {
                 let what = format!("{}, file {kind}, attempt {attempt}", setup.name);
                 rig.unlock(number).unwrap();
-                let mut told = [0; 8];
-                rig.node.read(Address::new(0x2006, number), &mut told).unwrap();
-                assert_eq!(told[..4], [0; 4], "{what}: 2006h");
+                let mut reported = [0; 8];
+                rig.node.read(Address::new(0x2006, number), &mut reported).unwrap();
+                assert_eq!(reported[..4], [0; 4], "{what}: 2006h");
                 if attempt % 2 == 0 {
                     rig.command(number, CLEAR).unwrap();
                 }

@@ -18,8 +18,8 @@ fn told_to_come_back(monitor: &mut Monitor, from: u32, until: u32) -> Vec<u32> {
 #[test]
 fn each_return_takes_twice_as_long_up_to_five_seconds() {
     let mut monitor = Monitor::new(at(0));
-    let told = told_to_come_back(&mut monitor, 0, 20_000);
-    assert_eq!(told, [200, 600, 1400, 3000, 6200, 11_200, 16_200]);
+    let reported = told_to_come_back(&mut monitor, 0, 20_000);
+    assert_eq!(reported, [200, 600, 1400, 3000, 6200, 11_200, 16_200]);
 }
 
 #[test]
@@ -38,12 +38,12 @@ fn a_return_is_told_and_one_that_lasts_restores_patience() {
 #[test]
 fn error_passive_is_told_when_it_begins_and_when_it_ends() {
     let mut monitor = Monitor::new(at(0));
-    let told: Vec<_> = [Active, Passive, Passive, Active, Active]
+    let reported: Vec<_> = [Active, Passive, Passive, Active, Active]
         .iter()
         .map(|state| monitor.observe(*state, at(1)))
         .collect();
     let tell = |event| Some(Consequence::Tell(event));
-    assert_eq!(told, [None, tell(LineEvent::Passive), None, tell(LineEvent::Active), None]);
+    assert_eq!(reported, [None, tell(LineEvent::Passive), None, tell(LineEvent::Active), None]);
 }
 
 #[test]

@@ -107,8 +107,8 @@ fn prints_the_chip_that_was_chosen() {
         ("worst", "board: silicon worst: LSI 47000 Hz, HSI 16640000 Hz"),
         ("7", "board: silicon 7: LSI "),
     ] {
-        let told = lines(&["--silicon", choice]);
-        assert!(told.len() == 1 && told[0].starts_with(words), "{told:?}");
+        let reported = lines(&["--silicon", choice]);
+        assert!(reported.len() == 1 && reported[0].starts_with(words), "{reported:?}");
     }
     assert_eq!(lines(&["--silicon", "7"]), lines(&["--silicon", "7"]));
     let two = lines(&["--silicon", "7", "--node-count", "2"]);

@@ -70,7 +70,7 @@ fn who_sends_on_pins_of_its_package_is_heard() {
         let (mut world, port, reports) = sender(chip, pins);
         let heard = world.receive(port).map(|(_, frame)| frame.to_string());
         assert_eq!(heard.as_deref(), is_heard.then_some("123#"), "{}, {pins:?}: {reports:?}", chip.chip);
-        let told = reports.iter().any(|what| what.contains("no pin of this package has its"));
-        assert_eq!(told, !is_heard, "{reports:?}");
+        let reported = reports.iter().any(|what| what.contains("no pin of this package has its"));
+        assert_eq!(reported, !is_heard, "{reports:?}");
     }
 }

@@ -134,12 +134,12 @@ fn what_is_programmed_with_too_little_voltage_does_not_last() {
         assert_eq!(word(&machine, 0x0804_0000), 0x1234_5678, "{mv} mV");
         assert_eq!(machine.counters().flash_weak, u64::from(is_weak), "{mv} mV");
         assert_eq!(machine.flash_cells().unstable.is_empty(), !is_weak, "{mv} mV");
-        let told: Vec<_> = machine.reports().iter().map(|report| report.what.as_str()).collect();
+        let reported: Vec<_> = machine.reports().iter().map(|report| report.what.as_str()).collect();
         match is_weak {
-            false => assert_eq!(told, [""; 0]),
+            false => assert_eq!(reported, [""; 0]),
             true => assert!(
-                told[0].contains("VDD is 2690 mV, and FLASH_CR.PSIZE of 32 bits needs 2700"),
-                "{told:?}"
+                reported[0].contains("VDD is 2690 mV, and FLASH_CR.PSIZE of 32 bits needs 2700"),
+                "{reported:?}"
             ),
         }
         let reads: std::collections::BTreeSet<u32> = (1..50)

@@ -9,7 +9,7 @@ use shared_abi::geometry::Region;
 use boot_core::crc32;
 use boot_core::store::{Journal, ProgramRecord};
 
-use super::story::{program_flash, Outcome, Seen, Story, BOOT_MS};
+use super::story::{program_flash, Observation, Outcome, Story, BOOT_MS};
 use crate::bench::Bench;
 use crate::{firmware, renewal};
 use kit::model::ModelFlash;
@@ -21,7 +21,7 @@ const VERSION: Address = Address::new(0x100A, 0);
 /// # Errors
 /// What it must not do: be silent, run something else than a whole program, or touch what the
 /// emulator does not model.
-pub fn look(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Seen, String> {
+pub fn switched_on(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Observation, String> {
     records_are_true(cells)?;
     bench.power_off();
     bench.machine().set_flash_cells(cells);
@@ -31,8 +31,8 @@ pub fn look(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Seen, Str
 /// The same with the flash that the board has; its power is off.
 ///
 /// # Errors
-/// As [`look`].
-pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
+/// As [`switched_on`].
+pub fn observe(story: &Story, bench: &mut Bench) -> Result<Observation, String> {
     bench.events();
     let from = bench.time();
     bench.power_on();
@@ -73,7 +73,7 @@ pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
     if !reports.is_empty() {
         return Err(format!("the firmware touched what the emulator does not model: {reports:?}"));
     }
-    Ok(Seen { outcome, node, bootloader })
+    Ok(Observation { outcome, node, bootloader })
 }
 
 /// Calls the bootloader, which mends what a cut has left of a renewal; returns its version.
