@@ -338,7 +338,7 @@ impl Bench {
     /// If the device does not return.
     pub fn call_back(&mut self) -> Time {
         self.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
-        self.await_boot_up(1000)
+        self.await_boot_up(100)
     }
 
     /// Starts program 1 from the bootloader: it has sent its boot-up message, at this time.
@@ -347,7 +347,7 @@ impl Bench {
     /// If it does not start.
     pub fn start_program(&mut self) -> Time {
         self.session().command(1, ProgramControl::Start).expect("it is answered");
-        self.await_boot_up(1000)
+        self.await_boot_up(500)
     }
 
     /// Makes the running program call the bootloader, which confirms the program, and starts it
@@ -367,7 +367,7 @@ impl Bench {
     /// If it does not start.
     pub fn switch_on(&mut self) -> Time {
         self.power_on();
-        self.await_boot_up(1000)
+        self.await_boot_up(500)
     }
 
     /// The same with the board.

@@ -28,7 +28,11 @@ const CODE: [(&str, &str, &[&str]); 6] = [
         &["fn start_bootloader(", "self.start_bootloader("],
     ),
     ("host test of the ABI", "tests/abi/main.rs", &["mod layout;", "mod header;", "mod reentry;"]),
-    ("test program of the ABI", "tests/kit/Cargo.toml", &["path = \"../abi/main.rs\""]),
+    (
+        "test program of the ABI",
+        "tests/kit/Cargo.toml",
+        &["[[test]]\nname = \"abi\"\npath = \"../abi/main.rs\""],
+    ),
 ];
 
 /// The parts of the repository that the orders are about.

@@ -96,7 +96,9 @@ impl Context {
     }
 
     fn named(&self, mut value: Value) -> Value {
-        value["command"] = self.command.as_str().into();
+        if let Value::Object(values) = &mut value {
+            values.insert("command".into(), self.command.as_str().into());
+        }
         value
     }
 

@@ -279,7 +279,11 @@ impl Typed {
             |id: &str| BESIDE_PACKAGES.contains(&id) || FOR_PACKAGES.iter().any(|(alone, _)| *alone == id);
         let refused =
             |option: &&Arg| is_typed(option.get_id().as_str()) && !is_free(option.get_id().as_str());
-        let option = flash.get_arguments().filter(|_| is_package).find(refused).and_then(Arg::get_long);
+        let option = flash
+            .get_arguments()
+            .filter(|_| is_package)
+            .find(refused)
+            .map(|option| option.get_long().unwrap_or_else(|| option.get_id().as_str()));
         let Some(option) = option else { return Ok(()) };
         let advice = "leave it out: the package says which device gets which program";
         Err(Failure::usage(format!("--{option} has no meaning beside a package"), advice))

@@ -79,15 +79,16 @@ pub(super) struct Status {
     clear: bool,
 }
 
-/// Carries out a command on one program of one device, and shows the result.
+/// Carries out a command on one program of one device, and shows the result. No second run of the tool
+/// works on a device whose program one `erases`.
 fn with(
     context: &Context,
     program: &Program,
+    erases: bool,
     act: impl FnOnce(&mut Session<'_>, u8, &mut dyn FnMut(Event)) -> Result<(String, Value), Error>,
 ) -> Result<(), Failure> {
     let mut link = context.link()?;
     let mut session = program.device.session(&mut link)?;
-    let erases = context.command == "erase";
     let _lock = erases.then(|| context.lock(context.bus.as_deref(), session.node())).transpose()?;
     let waiting =
         context.waiting(format!("node {} has carried out the command ({})", session.node(), context.command));
@@ -107,7 +108,7 @@ fn with(
 
 impl Start {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, |session, number, report| {
+        with(context, &self.program, false, |session, number, report| {
             let running = session.find()?;
             report(Event::Found(running));
             if !running.is_bootloader() {
@@ -129,7 +130,7 @@ impl Enter {
         if self.wait || self.limit.is_set() {
             return catch::run(context, &self.program.device, &self.limit, false);
         }
-        with(context, &self.program, |session, _, report| {
+        with(context, &self.program, false, |session, _, report| {
             let running = session.find()?;
             report(Event::Found(running));
             let words = if running.is_bootloader() {
@@ -145,7 +146,7 @@ impl Enter {
 
 impl Erase {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, |session, number, report| {
+        with(context, &self.program, true, |session, number, report| {
             session.ensure_alone()?;
             enter_bootloader(session, report)?;
             let began = session.now();
@@ -158,7 +159,7 @@ impl Erase {
 
 impl Release {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, |session, number, report| {
+        with(context, &self.program, false, |session, number, report| {
             // Report an absent device at once; the wait below is for a device that does not answer
             // the command.
             report(Event::Found(session.find()?));
@@ -170,7 +171,7 @@ impl Release {
 
 impl Withdraw {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, |session, number, report| {
+        with(context, &self.program, false, |session, number, report| {
             report(Event::Found(session.find()?));
             withdraw(session, number)?;
             let words =
@@ -182,7 +183,7 @@ impl Withdraw {
 
 impl Status {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, |session, number, report| {
+        with(context, &self.program, false, |session, number, report| {
             let running = session.find()?;
             report(Event::Found(running));
             if self.clear {

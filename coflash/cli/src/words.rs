@@ -32,13 +32,18 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
         let Some(word) = remaining.next() else { return words };
         let Some(text) = word.to_str() else { return words };
         let Some(name) = Name::of(text) else {
-            match root.find_subcommand(text) {
-                Some(command) => {
-                    kept.push(word.clone());
-                    break command;
-                }
-                None => return words,
+            if let Some(command) = root.find_subcommand(text) {
+                kept.push(word.clone());
+                break command;
             }
+            if paths(text, root).is_empty() {
+                return words;
+            }
+            // The command of a group without its group: the parser names the word, and not an option before.
+            kept.push(word.clone());
+            kept.extend(moved.into_iter().flat_map(|(_, words)| words));
+            kept.extend(remaining.cloned());
+            return kept;
         };
         let own = root.get_arguments().find(|argument| name.is_of(argument));
         let known = own.is_some() || ["help", "version", "h", "V"].contains(&name.bare);
@@ -92,11 +97,44 @@ pub fn path(matches: &ArgMatches) -> String {
 }
 
 /// Adds the full command to an error about an unknown one, where a group has a command of this name.
-/// A plural s makes no difference.
 pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) -> clap::Error {
     let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else { return error };
     let words = secrets::without(words, None);
-    let Some(at) = words.iter().position(|word| word == name) else { return error };
+    // The value of an option may be the same word.
+    let is_value = |at: usize| {
+        let option = Name::of(&words[at - 1]);
+        option.is_some_and(|name| within(root, &name).is_some_and(|option| name.takes_next(option)))
+    };
+    let Some(at) = (1..words.len()).find(|&at| words[at] == *name && !is_value(at)) else { return error };
+    // Options may come before the command, and so may the name of another group.
+    let mut group = root;
+    let before = words[1..at].iter().filter(|word| match group.find_subcommand(word) {
+        Some(below) => {
+            group = below;
+            false
+        }
+        None => true,
+    });
+    let before: String = before.map(|word| format!(" {word}")).collect();
+    let after: String = words[at + 1..].iter().map(|word| format!(" {word}")).collect();
+    let given = format!(" {}", words[1..].join(" "));
+    let lines = paths(name, root).into_iter().map(|path| format!("{before}{path}{after}"));
+    let tips: Vec<_> = lines
+        .filter(|line| *line != given)
+        .map(|line| format!("the command is 'coflash{line}'").into())
+        .collect();
+    if tips.is_empty() {
+        return error;
+    }
+    let tips = ContextValue::StyledStrs(tips);
+    error.remove(ContextKind::SuggestedSubcommand);
+    error.insert(ContextKind::Suggested, tips);
+    error
+}
+
+/// The full names of the commands with this name on the first level that has one, each after a blank. A
+/// plural s makes no difference.
+fn paths(name: &str, root: &Command) -> Vec<String> {
     let is_same = |below: &Command| below.get_name().trim_end_matches('s') == name.trim_end_matches('s');
     let mut level = vec![(String::new(), root)];
     let mut found: Vec<String> = Vec::new();
@@ -109,25 +147,7 @@ pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) ->
         found.extend(next.iter().filter(|(_, below)| is_same(below)).map(|(path, _)| path.clone()));
         level = next;
     }
-    if found.is_empty() {
-        return error;
-    }
-    // Options may come before the command, and so may the name of another group.
-    let mut group = root;
-    let before = words[1..at].iter().filter(|word| match group.find_subcommand(word) {
-        Some(below) => {
-            group = below;
-            false
-        }
-        None => true,
-    });
-    let before: String = before.map(|word| format!(" {word}")).collect();
-    let after: String = words[at + 1..].iter().map(|word| format!(" {word}")).collect();
-    let tips = found.iter().map(|path| format!("the command is 'coflash{before}{path}{after}'").into());
-    let tips = ContextValue::StyledStrs(tips.collect());
-    error.remove(ContextKind::SuggestedSubcommand);
-    error.insert(ContextKind::Suggested, tips);
-    error
+    found
 }
 
 /// The first command or subcommand that has this option.
@@ -220,8 +240,12 @@ mod tests {
             ("step", &["more debug step"]),
             ("show a.cbs", &["seal show a.cbs"]),
             ("flsh a", &[]),
+            ("-N 5 release", &["more release -N 5"]),
+            ("--bus release release -N 5", &["--bus release more release -N 5"]),
+            ("seal seal x", &[]),
         ] {
-            let words = || std::iter::once("coflash").chain(line.split(' ')).map(OsString::from).collect();
+            // A link to the program may have the name of a command.
+            let words = || std::iter::once("release").chain(line.split(' ')).map(OsString::from).collect();
             let words: Vec<OsString> = ordered(words(), &super::super::commands());
             let error = super::super::commands().try_get_matches_from(&words).unwrap_err();
             let error = with_paths(error, &words, &super::super::commands());

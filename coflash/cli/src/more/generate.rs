@@ -14,6 +14,7 @@ use crate::output::{Failure, EXIT_CODES};
 /// Writes shell completions to standard output.
 #[derive(Debug, Args)]
 pub(crate) struct Completions {
+    /// The shell that reads them.
     #[arg(value_enum)]
     shell: Shell,
 }
@@ -71,7 +72,13 @@ fn write_pages(command: &Command, folder: &Path) -> io::Result<()> {
 /// A page in the order of man-pages(7).
 fn page(command: &Command) -> io::Result<Vec<u8>> {
     let mut page = Vec::new();
-    let man = Man::new(command.clone());
+    // A page shows the long help alone of an option that the short help leaves out.
+    let man = Man::new(command.clone().mut_args(|option| {
+        match (option.get_long_help(), option.get_help().cloned()) {
+            (None, Some(words)) => option.long_help(words),
+            _ => option,
+        }
+    }));
     man.render_title(&mut page)?;
     man.render_name_section(&mut page)?;
     man.render_synopsis_section(&mut page)?;

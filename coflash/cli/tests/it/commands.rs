@@ -608,6 +608,17 @@ fn completions_and_manual_pages_are_written() {
         assert!(own.contains(words), "{section}: {own}");
         rest = behind;
     }
+    // A tagged paragraph (man(7)) has its words, also for an option that the short help leaves out.
+    for page in fs::read_dir(folder.path("pages")).unwrap().map(|page| page.unwrap().path()) {
+        let text = fs::read_to_string(&page).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        let is_empty = |at: &usize| {
+            lines[*at] == ".TP"
+                && lines.get(at + 2).is_none_or(|line| line.is_empty() || line.starts_with('.'))
+        };
+        let empty: Vec<&str> = (0..lines.len()).filter(is_empty).map(|at| lines[at + 1]).collect();
+        assert_eq!(empty, Vec::<&str>::new(), "{}", page.display());
+    }
     for command in ["", "-read", "-write", "-nmt", "-lss-assign", "-seal", "-seal-keys-new", "-more-release"]
     {
         assert!(fs::metadata(folder.path(&format!("pages/coflash{command}.1"))).is_ok(), "{command}");

@@ -1,7 +1,7 @@
 //! The master of layer setting services (CiA 305): sets node-ID and bit rate over the bus, for
 //! devices without switches.
 
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -239,6 +239,10 @@ impl<'a> Master<'a> {
     }
 
     fn send(&mut self, request: [u8; 8]) -> Result<(), Error> {
+        // No command goes out after a cancellation: the last one may change the bit rate of a bus.
+        if self.cancelled.load(Ordering::Relaxed) {
+            return Err(Error::Cancelled);
+        }
         Ok(self.adapter.send(&Frame::of(CobId::LSS_REQUEST, &request))?)
     }
 

@@ -197,19 +197,19 @@ impl Image {
     #[must_use]
     pub fn bytes<const N: usize>(&self, address: u32) -> Option<[u8; N]> {
         let mut bytes = [0; N];
-        let mut reported = 0;
+        let mut present = 0;
         let end = u64::from(address) + N as u64;
         for piece in &self.pieces {
             let from = u64::from(piece.address);
-            let (first, behind) = (from.max(address.into()), (from + piece.data.len() as u64).min(end));
-            if first < behind {
-                let data = &piece.data[(first - from) as usize..(behind - from) as usize];
+            let (first, after) = (from.max(address.into()), (from + piece.data.len() as u64).min(end));
+            if first < after {
+                let data = &piece.data[(first - from) as usize..(after - from) as usize];
                 let at = (first - u64::from(address)) as usize;
                 bytes[at..at + data.len()].copy_from_slice(data);
-                reported += data.len();
+                present += data.len();
             }
         }
-        (reported == N).then_some(bytes)
+        (present == N).then_some(bytes)
     }
 
     /// The value of all bytes, if they are all equal.

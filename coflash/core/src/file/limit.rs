@@ -21,16 +21,16 @@ pub fn read(path: &Path) -> Result<Vec<u8>, Cause> {
 
 fn read_at_most(path: &Path, most: u64) -> Result<Vec<u8>, Cause> {
     // Checked before opening: to open a FIFO waits for its writer.
-    let reported = std::fs::metadata(path).map_err(Cause::Io)?;
-    if !reported.is_file() {
-        return Err(Cause::NoRegularFile(if reported.is_dir() {
+    let metadata = std::fs::metadata(path).map_err(Cause::Io)?;
+    if !metadata.is_file() {
+        return Err(Cause::NoRegularFile(if metadata.is_dir() {
             "a folder"
         } else {
             "a device, pipe or socket"
         }));
     }
-    if reported.len() > most {
-        return Err(Cause::TooLarge { size: reported.len(), most });
+    if metadata.len() > most {
+        return Err(Cause::TooLarge { size: metadata.len(), most });
     }
     let mut bytes = Vec::new();
     // The file may be another one by now, or it may grow during the read.

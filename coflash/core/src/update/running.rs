@@ -120,6 +120,7 @@ impl<'t> RunningUpdate<'t> {
             Event::Note(Note::Together { devices }) if self.together == *devices => return,
             Event::Note(Note::Together { devices }) => self.together = *devices,
             Event::Warning(Warning::GroupDisturbed) if std::mem::replace(&mut self.disturbed, true) => return,
+            Event::Warning(Warning::BeginsAgain { .. }) => (self.together, self.disturbed) = (0, false),
             _ => {}
         }
         if let Some(reported) = &mut self.reported {

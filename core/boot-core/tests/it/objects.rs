@@ -128,6 +128,10 @@ fn each_program_has_its_own_values_and_no_other_exists() {
         assert_eq!(read(&mut rig, 0x2004, number), Ok(vec![0; 8]), "{number}");
     }
     assert_eq!(rig.chip.model().touched, []);
+    // A product with one program has no second one.
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    assert_eq!(rig.command(2, START), Err(NO_SUB_INDEX));
+    assert_eq!(rig.begin(2, None, &[]), Err(NO_SUB_INDEX));
 }
 
 /// The label must lie inside the program: bytes after it are none of its own.

@@ -6,7 +6,7 @@ use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
 use super::procedure::{idle, Procedure};
-use crate::device::error::{absent, reported};
+use crate::device::error::absent;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::update::event::Note;
 use crate::update::judge::DownloadStatus;
@@ -49,7 +49,8 @@ impl Procedure for EsAcademy {
         }
         let register = match session.read_number(Address::new(program::ERROR_REGISTER, 0)) {
             Err(Error::NoAnswer { .. }) => None,
-            register => reported(register)?,
+            Err(Error::Refused { code, .. }) if absent(code) => None,
+            register => Some(register?),
         };
         let failed = register.is_some_and(|bits| bits & ERROR_BITS == ERROR_BITS);
         Ok(failed.then_some((FlashError::Unspecified, 0)))

@@ -73,7 +73,6 @@ impl Procedure for Lift {
     }
 
     fn start(&self, session: &mut Session<'_>, original: NodeId, number: u8) -> Result<DeviceType, Error> {
-        let began = session.now();
         reset_program(session, LIFT_PROGRAM)?;
         if original == lift_node() {
             let boot = session.timing().boot;
@@ -83,6 +82,8 @@ impl Procedure for Lift {
         } else {
             session.talk_to(original);
         }
+        // The boot-up that led to this node is no other device's.
+        let began = session.now();
         await_program(session, number, began)
     }
 }

@@ -11,6 +11,8 @@ use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::error::{Error, LssFailure};
 use coflash_core::device::lss::{BitRate, LssAddress, LssDoing, Master, ANSWER};
 
+use crate::tap::Tap;
+
 const ADDRESS: LssAddress = LssAddress {
     vendor_id: 0x0000_003F,
     product_code: 0x1122_3344,
@@ -289,7 +291,13 @@ fn what_others_say_is_passed_over_and_cancelling_ends_it() {
     noisy.outbox.push_back(answer([0x5E, 99, 0, 0, 0, 0, 0, 0]));
     assert_eq!(Master::new(&mut noisy, ANSWER).inquire_node_id().unwrap(), NodeId::new(5));
     let flag = Arc::new(AtomicBool::new(true));
-    let mut master = Master::new(&mut noisy, ANSWER);
+    let mut sent = 0;
+    let mut counted = Tap::sending(noisy, |_, _| sent += 1);
+    let mut master = Master::new(&mut counted, ANSWER);
     master.cancel_by(flag);
     assert!(matches!(master.fastscan(&mut |_| {}), Err(Error::Cancelled)));
+    // A bus whose user has cancelled keeps its bit rate.
+    assert!(matches!(master.activate(Duration::from_millis(20)), Err(Error::Cancelled)));
+    drop(counted);
+    assert_eq!(sent, 0);
 }
