@@ -229,9 +229,23 @@ fn a_bundle_has_what_the_device_says_and_no_values_of_read() {
     );
     assert!(json(&members, "-report.json")["result"].is_null());
     assert!(text(&members, "-trace.log").contains(" 585#"), "{}", text(&members, "-trace.log"));
-    for (name, bytes) in &members {
-        let text = String::from_utf8(bytes.clone()).unwrap();
-        assert!(!text.contains("FIRMWARE") && !text.contains("4649524D"), "{name}: {text}");
+    let contents_stay = |members: &[(String, Vec<u8>)]| {
+        for (name, bytes) in members {
+            let text = String::from_utf8(bytes.clone()).unwrap();
+            assert!(!text.contains("FIRMWARE") && !text.contains("4649524D"), "{name}: {text}");
+        }
+    };
+    contents_stay(&members);
+    // The other commands that show what is in a device.
+    for command in ["more debug read", "more shell"] {
+        let report = Path::new(&of_run).join("report.json");
+        let mut document: Value = serde_json::from_slice(&fs::read(&report).unwrap()).unwrap();
+        document["command"] = command.into();
+        document["result"] = "FIRMWARE".into();
+        fs::write(&report, document.to_string()).unwrap();
+        fs::remove_file(folder.path("coflash-report.zip")).unwrap();
+        run_in(&folder, &["more", "report", "bundle", &of_run]).good();
+        contents_stay(&self::members(&folder.path("coflash-report.zip")));
     }
 }
 
