@@ -278,6 +278,15 @@ fn the_scripts_of_the_document_are_played() {
     bench.assert_nothing_unmodelled();
 }
 
+/// The standard images do not have this object.
+#[test]
+fn without_the_feature_there_is_no_interface() {
+    let mut bench = Bench::new().switched_on();
+    assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
+    bench.install(firmware::APP_V1);
+    assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
+}
+
 /// A variable at run time, without stopping the program.
 #[test]
 fn the_application_is_looked_at_while_it_runs() {
