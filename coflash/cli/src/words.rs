@@ -96,7 +96,8 @@ pub fn path(matches: &ArgMatches) -> String {
     below.map(|(name, _)| name).collect::<Vec<_>>().join(" ")
 }
 
-/// Adds the full command to an error about an unknown one, where a group has a command of this name.
+/// Adds the full command to an error about an unknown one, where a group has a command of this name;
+/// otherwise the commands of the group in which it was searched.
 pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) -> clap::Error {
     let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else { return error };
     let words = secrets::without(words, None);
@@ -105,24 +106,32 @@ pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) ->
         let option = Name::of(&words[at - 1]);
         option.is_some_and(|name| within(root, &name).is_some_and(|option| name.takes_next(option)))
     };
-    let Some(at) = (1..words.len()).find(|&at| words[at] == *name && !is_value(at)) else { return error };
     // Options may come before the command, and so may the name of another group.
-    let mut group = root;
-    let before = words[1..at].iter().filter(|word| match group.find_subcommand(word) {
-        Some(below) => {
-            group = below;
-            false
+    let (mut group, mut at, mut before) = (root, 1, String::new());
+    loop {
+        match words.get(at) {
+            None => return error,
+            Some(word) if is_value(at) => before += &format!(" {word}"),
+            Some(word) => match group.find_subcommand(word) {
+                Some(below) => group = below,
+                None if word == name => break,
+                None => before += &format!(" {word}"),
+            },
         }
-        None => true,
-    });
-    let before: String = before.map(|word| format!(" {word}")).collect();
+        at += 1;
+    }
     let after: String = words[at + 1..].iter().map(|word| format!(" {word}")).collect();
     let given = format!(" {}", words[1..].join(" "));
     let lines = paths(name, root).into_iter().map(|path| format!("{before}{path}{after}"));
-    let tips: Vec<_> = lines
+    let mut tips: Vec<_> = lines
         .filter(|line| *line != given)
         .map(|line| format!("the command is 'coflash{line}'").into())
         .collect();
+    let is_like_another = error.get(ContextKind::SuggestedSubcommand).is_some();
+    if tips.is_empty() && !is_like_another && group.get_name() != root.get_name() {
+        let below: Vec<&str> = group.get_subcommands().map(Command::get_name).collect();
+        tips.push(format!("the commands of '{}' are {}", group.get_name(), below.join(", ")).into());
+    }
     if tips.is_empty() {
         return error;
     }
@@ -242,7 +251,9 @@ mod tests {
             ("flsh a", &[]),
             ("-N 5 release", &["more release -N 5"]),
             ("--bus release release -N 5", &["--bus release more release -N 5"]),
-            ("seal seal x", &[]),
+            ("seal seal x", &["seal x"]),
+            // A file where the command of a group was meant.
+            ("seal app.elf --board x", &[]),
         ] {
             // A link to the program may have the name of a command.
             let words = || std::iter::once("release").chain(line.split(' ')).map(OsString::from).collect();
@@ -255,6 +266,8 @@ mod tests {
             let tips: Vec<String> = error.to_string().lines().filter_map(tip).collect();
             assert_eq!(tips, commands, "{line}: {error}");
             assert_eq!((error.kind(), error.exit_code()), (clap::error::ErrorKind::InvalidSubcommand, 2));
+            let lists = error.to_string().contains("tip: the commands of 'seal' are keys, image, ");
+            assert_eq!(lists, commands.is_empty() && line.starts_with("seal "), "{line}: {error}");
         }
     }
 
