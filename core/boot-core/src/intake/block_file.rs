@@ -151,15 +151,20 @@ impl BlockFile {
     fn has_come(&self, next: u32, to: &Destination<'_, '_>) -> Result<bool, Refusal> {
         let Header { number, flash_address, size } = self.header;
         let last = &to.queue.last;
-        // A client that sends to several devices repeats a block until all of them have it.
-        if last.is_again(next, number) {
-            return last.has_crc(self.crc).then_some(true).ok_or(Refusal::untimely(FlashError::Sequence));
-        }
-        if to.judge.images.only_sealed().is_none() || next != ANY || flash_address == last.end() {
+        let is_repeat = if last.is_again(next, number) {
+            // A client that sends to several devices repeats a block until all of them have it.
+            last.has_crc(self.crc)
+        } else if to.judge.images.only_sealed().is_some() && next == ANY && flash_address != last.end() {
+            // The bytes of a sealed image are processed in order, and each once.
+            flash_address + size <= last.end()
+        } else {
             return Ok(false);
+        };
+        if is_repeat {
+            Ok(true)
+        } else {
+            Err(Refusal::untimely(FlashError::Sequence))
         }
-        // The bytes of a sealed image are processed in order, and each once.
-        (flash_address + size <= last.end()).then_some(true).ok_or(Refusal::untimely(FlashError::Sequence))
     }
 
     /// The control block begins the program.
