@@ -347,7 +347,7 @@ impl Bench {
     /// If it does not start.
     pub fn start_program(&mut self) -> Time {
         self.session().command(1, ProgramControl::Start).expect("it is answered");
-        self.await_boot_up(500)
+        self.await_boot_up(100)
     }
 
     /// Makes the running program call the bootloader, which confirms the program, and starts it
@@ -367,7 +367,7 @@ impl Bench {
     /// If it does not start.
     pub fn switch_on(&mut self) -> Time {
         self.power_on();
-        self.await_boot_up(500)
+        self.await_boot_up(100)
     }
 
     /// The same with the board.
