@@ -219,6 +219,17 @@ fn put_words(bytes: &mut [u8], words: &[u32]) {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ProgramVersion(pub u32);
 
+impl ProgramVersion {
+    /// Whether this version was before another one: major, minor and release count in this order.
+    #[must_use]
+    pub const fn is_before(self, other: Self) -> bool {
+        let [major, minor, ..] = self.0.to_le_bytes();
+        let [other_major, other_minor, ..] = other.0.to_le_bytes();
+        let (one, two) = (u16::from_be_bytes([major, minor]), u16::from_be_bytes([other_major, other_minor]));
+        one < two || one == two && self.0 >> 16 < other.0 >> 16
+    }
+}
+
 impl fmt::Display for ProgramVersion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [major, minor, ..] = self.0.to_le_bytes();
@@ -247,6 +258,16 @@ mod tests {
             ((7, 8), (7, 0), Err(ProductCode)),
         ] {
             assert_eq!(fits(program, device), expected, "{program:?} {device:?}");
+        }
+    }
+
+    #[test]
+    fn the_major_number_counts_first_and_the_release_last() {
+        let versions = [0x0064_0A01, 0x0065_0A01, 0x0000_0B01, 0xFFFF_0102, 0x0000_0203].map(ProgramVersion);
+        for (at, one) in versions.iter().enumerate() {
+            for (place, two) in versions.iter().enumerate() {
+                assert_eq!(one.is_before(*two), at < place, "{one} {two}");
+            }
         }
     }
 

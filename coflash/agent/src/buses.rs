@@ -9,8 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{channel, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_ID};
-use canopen::Address;
+use canopen::program::ProgramState;
 
 use super::config::{Device, Target, TargetKind};
 use super::controller::{Flashed, News};
@@ -19,12 +18,12 @@ use super::machine;
 use super::progress::{failure, waits, Shown};
 use super::run::{Devices, Order};
 use coboot_can::Link;
+use coflash_core::device::info::program_info;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::state::{reason, source, supply};
 use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
-use coflash_core::machine::Package;
 use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
-use coflash_core::update::{Event, FlashOptions, Payload, Report};
+use coflash_core::update::{Event, FlashOptions, Installed, Known, Payload, Report};
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
@@ -126,9 +125,9 @@ impl Buses<'_> {
         let mut session = Session::on(link, job.node, Timing::default());
         session.cancel_by(self.cancelled.clone());
         let program = job.options.program;
-        let mut number = |index| session.read_number(Address::new(index, program)).ok();
-        number(PROGRAM_CONTROL) == Some(ProgramState::Running as u32)
-            && number(PROGRAM_ID).is_some_and(|crc| job.file.crcs().contains(&crc))
+        program_info(&mut session, program).is_ok_and(|has| {
+            has.state() == Some(ProgramState::Running) && job.file.marks().compare(&has) == Installed::This
+        })
     }
 }
 
@@ -148,32 +147,22 @@ impl Devices for Buses<'_> {
     }
 
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
-        let Order { target, content, kept } = order;
+        let Order { target, content, kept, begun } = order;
+        let known = if begun { Known::begun() } else { Known::default() };
         match content {
-            Content::Program(device, program) => self.device(target, device, program, kept, news),
-            Content::Package(package) => self.machine(target, &package, &news),
+            Content::Program(device, program) => self.device(target, job(device, program, known), kept, news),
+            Content::Package(machine, package) => {
+                self.machine(target, &machine::Order { package: &package, machine, known }, &news)
+            }
         }
     }
 }
 
 impl Buses<'_> {
     /// Updates a device, together with those that wait for the same bus.
-    fn device(
-        &self,
-        target: &Target,
-        device: &Device,
-        program: Payload,
-        kept: bool,
-        news: Sender<News>,
-    ) -> Flashed {
-        let options = FlashOptions::default()
-            .program(device.program)
-            .check_target(program.target().filter(|_| device.check_target))
-            .trial_run(device.trial_run)
-            .verify(device.verify);
+    fn device(&self, target: &Target, job: Job, kept: bool, news: Sender<News>) -> Flashed {
         let (done, result) = channel();
         let bus = self.bus(&target.bus);
-        let job = Job::new(device.node, program, options);
         lock(&bus.waiting).push(Waiting { job, kept, news, done });
         let _turn = lock(&bus.turn);
         // Another thread may have carried this order out together with its own.
@@ -190,7 +179,7 @@ impl Buses<'_> {
     }
 
     /// Updates a machine, when the bus is free.
-    fn machine(&self, target: &Target, package: &Package, news: &Sender<News>) -> Flashed {
+    fn machine(&self, target: &Target, order: &machine::Order<'_>, news: &Sender<News>) -> Flashed {
         let bus = self.bus(&target.bus);
         let _turn = lock(&bus.turn);
         if self.cancelled.load(Ordering::Relaxed) {
@@ -198,12 +187,24 @@ impl Buses<'_> {
         }
         match (self.open)(&target.bus) {
             Ok(link) => {
-                let ended = machine::update(link, &target.bus, package, &self.cancelled, news);
+                let ended = machine::update(link, &target.bus, order, &self.cancelled, news);
                 ended.unwrap_or_else(|ended| ended)
             }
             Err(why) => Flashed::NotNow(why),
         }
     }
+}
+
+/// The update of a device with a program.
+fn job(device: &Device, program: Payload, known: Known) -> Job {
+    let options = FlashOptions::default()
+        .program(device.program)
+        .check_target(program.target().filter(|_| device.check_target))
+        .trial_run(device.trial_run)
+        .verify(device.verify);
+    let mut job = Job::new(device.node, program, options);
+    job.known = known;
+    job
 }
 
 /// A program in words.

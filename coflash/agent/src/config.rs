@@ -60,6 +60,8 @@ pub enum TargetKind {
 pub struct Machine {
     /// The roots that may sign its packages; at least one.
     pub trust: Vec<PublicKey>,
+    /// Whether programs are written that are older than those of the devices.
+    pub allow_older: bool,
 }
 
 /// A device.
@@ -155,6 +157,8 @@ struct Entry<T> {
 struct OneMachine {
     #[serde(default)]
     trust: Vec<PathBuf>,
+    #[serde(default)]
+    allow_older: bool,
 }
 
 #[derive(Debug, Deserialize)]
@@ -323,7 +327,8 @@ impl OneMachine {
             let of = |why: &dyn fmt::Display| format!("{}: {why}", path.display());
             PublicKey::from_pem(&text.map_err(|error| of(&error))?).map_err(|fault| of(&fault))
         };
-        Ok(Machine { trust: self.trust.iter().map(key).collect::<Result<_, _>>()? })
+        let trust = self.trust.iter().map(key).collect::<Result<_, _>>()?;
+        Ok(Machine { trust, allow_older: self.allow_older })
     }
 }
 

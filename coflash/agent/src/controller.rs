@@ -82,6 +82,8 @@ pub(super) struct Flash {
     /// Whether an agent before this one has seen that the device keeps the program: if the device
     /// says so too, it needs nothing more.
     pub(super) kept: bool,
+    /// Whether an agent before this one has begun with it, and may have changed the device.
+    pub(super) begun: bool,
 }
 
 /// What became of an order to flash; the texts are for the server.
@@ -386,10 +388,10 @@ impl Controller {
             return Step::AskDevice;
         }
         if !self.unsaved {
-            if let Work::Flashing { task, started: started @ false, .. } = &mut self.work {
+            if let Work::Flashing { task, started: started @ false, first, .. } = &mut self.work {
                 *started = true;
                 let kept = self.record.begun.as_ref().is_some_and(|begun| begun.kept);
-                return Step::Flash(Flash { wanted: task.wanted.clone(), kept });
+                return Step::Flash(Flash { wanted: task.wanted.clone(), kept, begun: !*first });
             }
         }
         if now < self.hold {

@@ -13,7 +13,7 @@ pub enum Content<'t> {
     /// A program for a device.
     Program(&'t Device, Payload),
     /// A package for a machine.
-    Package(Box<Package>),
+    Package(&'t Machine, Box<Package>),
 }
 
 /// Reads and judges a file, as `coflash flash` does, without any device.
@@ -22,7 +22,9 @@ pub enum Content<'t> {
 /// The lines for the server: what is wrong, and what to do.
 pub(super) fn content<'t>(bytes: &[u8], name: &str, target: &'t Target) -> Result<Content<'t>, Vec<String>> {
     match &target.what {
-        TargetKind::Machine(machine) => package(bytes, name, machine).map(Box::new).map(Content::Package),
+        TargetKind::Machine(machine) => {
+            package(bytes, name, machine).map(|package| Content::Package(machine, Box::new(package)))
+        }
         TargetKind::Device(_) if is_package(Path::new(name), bytes) => Err(lines(
             format!("{name} is a package for a machine, and this target is one device"),
             "deploy the program of this device alone, or give the package to a target that the agent's \

@@ -11,11 +11,20 @@ use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{plan, run, Bad, DeviceFault, Good, Outcome, Package, PlanError, RunOptions};
-use coflash_core::update::{Event, ManyOptions};
+use coflash_core::update::{Event, Known, ManyOptions};
 use coflash_core::Error;
 
+use super::config::Machine;
 use super::controller::{Flashed, News};
 use super::progress::{failure, not_now, waits, Shown};
+
+/// What a machine gets.
+pub(super) struct Order<'o> {
+    pub(super) machine: &'o Machine,
+    pub(super) package: &'o Package,
+    /// What is known of its devices from an earlier agent.
+    pub(super) known: Known,
+}
 
 /// Updates the devices of a bus that the package is for. An interrupted update goes on with another call:
 /// its plan leaves out what the devices have.
@@ -25,7 +34,7 @@ use super::progress::{failure, not_now, waits, Shown};
 pub(super) fn update(
     link: Link,
     url: &str,
-    package: &Package,
+    Order { machine, package, known }: &Order<'_>,
     cancelled: &Arc<AtomicBool>,
     news: &Sender<News>,
 ) -> Result<Flashed, Flashed> {
@@ -39,11 +48,14 @@ pub(super) fn update(
     let mut locks = BTreeMap::new();
     let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
     lock(url, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
-    let plan =
+    let mut plan =
         plan(&mut *adapter, package, &ScanOptions::default().alone(true), cancelled).map_err(unplanned)?;
     lock(url, plan.nodes(), &mut locks)?;
     for line in plan.to_string().lines() {
         let _ = news.send(News::Phase(line.to_string()));
+    }
+    if machine.allow_older {
+        plan.allow_older(|_| true);
     }
     let all = plan.updates().max(1);
     let percents = Mutex::new(BTreeMap::new());
@@ -64,7 +76,8 @@ pub(super) fn update(
             let _ = news.send(of_all);
         }
     };
-    let options = RunOptions::default().many(ManyOptions::default().cancelled(cancelled.clone()));
+    let many = ManyOptions::default().cancelled(cancelled.clone());
+    let options = RunOptions::default().many(many).known(*known);
     Ok(flashed(package, &run(&mut *adapter, package, &plan, &options, &report)))
 }
 

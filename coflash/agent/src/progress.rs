@@ -59,7 +59,8 @@ pub(super) fn not_now(error: &Error) -> Option<String> {
 
 /// The same of an update that has failed.
 pub(super) fn waits(Failed { error, left }: &Failed) -> Option<String> {
-    not_now(error).filter(|_| left.state == DeviceState::Untouched)
+    // What an earlier attempt may have changed, this one has not.
+    not_now(error).filter(|_| matches!(left.state, DeviceState::Untouched | DeviceState::Begun))
 }
 
 /// What happened, the state of the device, what it has answered, and what to do.

@@ -12,7 +12,7 @@ use crc::{Crc, CRC_64_XZ};
 
 use super::backoff::Jitter;
 use super::config::{Config, Target};
-use super::controller::{Controller, Flash, Flashed, Kind, Message, News, Rules, Step, Wanted};
+use super::controller::{Controller, Flash, Flashed, Kind, Message, News, Rules, Step};
 use super::download::{self, Pause};
 use super::firmware::{self, Content};
 use super::http::{Client, Limits};
@@ -42,6 +42,8 @@ pub struct Order<'o> {
     /// Whether an earlier agent has seen that the device keeps this program. If it runs, the order
     /// is carried out already.
     pub kept: bool,
+    /// Whether an earlier agent has begun with this order: nobody knows what it has changed.
+    pub begun: bool,
 }
 
 coflash_core::options! {
@@ -265,10 +267,10 @@ fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
                         let _ = sender.send(Heard::Attributes(shared.devices.attributes(target)));
                     });
                 }
-                Step::Flash(Flash { wanted, kept }) => {
+                Step::Flash(order) => {
                     let sender = sender.clone();
                     let path = &path;
-                    scope.spawn(move || flash(shared, target, path.clone(), &wanted, kept, &sender));
+                    scope.spawn(move || flash(shared, target, path.clone(), &order, &sender));
                 }
             }
         }
@@ -298,8 +300,7 @@ fn flash(
     shared: &Shared<'_>,
     target: &Target,
     path: PathBuf,
-    wanted: &Wanted,
-    kept: bool,
+    Flash { wanted, kept, begun }: &Flash,
     sender: &Sender<Heard>,
 ) {
     let (news, hear) = channel();
@@ -312,7 +313,7 @@ fn flash(
         let bytes = download::bytes(&path, wanted).map_err(|why| vec![why]);
         let content = bytes.and_then(|bytes| firmware::content(&bytes, &wanted.name, target));
         match content {
-            Ok(content) => shared.devices.flash(Order { target, content, kept }, news),
+            Ok(content) => shared.devices.flash(Order { target, content, kept: *kept, begun: *begun }, news),
             Err(lines) => {
                 drop(news);
                 Flashed::Failed(lines)

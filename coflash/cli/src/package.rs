@@ -11,6 +11,7 @@ use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
+use coflash_core::file::inspect::Date;
 use coflash_core::file::limit;
 use coflash_core::machine::{
     self, kind, version, Bad, Good, Outcome, Package, Plan, PlanError, Recipe, RunOptions, Signer,
@@ -153,6 +154,9 @@ fn show(context: &Context, path: &Path, checked: &Checked) {
     for text in [&manifest.name, &manifest.release].into_iter().flatten() {
         words += &format!(", {text}");
     }
+    if let Some(date) = package.date() {
+        words += &format!(", newest program of {}", Date(date));
+    }
     words += "\n";
     for (entry, program) in package.programs() {
         let version = version(program).map_or(String::new(), |version| format!(", version {version}"));
@@ -183,6 +187,7 @@ fn show(context: &Context, path: &Path, checked: &Checked) {
             "output": path.display().to_string(),
             "name": manifest.name,
             "release": manifest.release,
+            "date": package.date(),
             "programs": package.programs().map(program).collect::<Vec<_>>(),
             "signers": package.signers().iter().map(|signer| json!({
                 "key": signer.key,
@@ -256,9 +261,10 @@ pub(super) const BESIDE_PACKAGES: [&str; 31] = [
 ];
 
 /// The options for packages alone, and what they would do.
-pub(super) const FOR_PACKAGES: [(&str, &str); 2] = [
+pub(super) const FOR_PACKAGES: [(&str, &str); 3] = [
     ("yes", "only the update with a package is confirmed"),
     ("trust", "only the signers of a package are compared with --trust"),
+    ("allow_older", "only the programs of a package are not written where the device has a newer one"),
 ];
 
 /// The options that a user has typed: a default, also one of the configuration, contradicts nothing.
@@ -272,7 +278,8 @@ impl Typed {
         let is_typed = |id: &str| self.0.iter().any(|typed| typed == id);
         let mut alone = FOR_PACKAGES.iter().filter(|(id, _)| is_typed(id));
         if let (false, Some((_, what))) = (is_package, alone.next()) {
-            let advice = "leave --yes and --trust out, or name a package that coflash package made";
+            let advice =
+                "leave --yes, --trust and --allow-older out, or name a package that coflash package made";
             return Err(Failure::usage(*what, advice));
         }
         let is_free =
@@ -325,6 +332,10 @@ pub(super) struct Machine {
     /// Carry out the plan of a package without asking.
     #[arg(long, short)]
     yes: bool,
+
+    /// Also write programs of a package that are older than those of the devices.
+    #[arg(long)]
+    allow_older: bool,
 }
 
 /// What an update with a package takes from the other options.
@@ -363,6 +374,9 @@ impl Machine {
         let out = context.out;
         let checked = read(path, &self.trusted)?;
         checked.signers().iter().for_each(|line| out.say(line));
+        if let Some(date) = checked.package.date() {
+            out.say(format_args!("its newest program is of {}", Date(date)));
+        }
         let package = checked.package;
         let Link::Bus(mut adapter) = context.link_at(given.bus.as_deref(), given.bit_rate)? else {
             let advice = "connect to the bus of the machine with an adapter";
@@ -378,12 +392,15 @@ impl Machine {
         given.lock(context, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
         let waiting = context.waiting("all nodes were asked, and had time to answer");
         let scan = ScanOptions::default().timing(given.patience.timing()).alone(!given.not_alone);
-        let plan = machine::plan(&mut *adapter, &package, &scan, &flag).map_err(|error| match error {
+        let mut plan = machine::plan(&mut *adapter, &package, &scan, &flag).map_err(|error| match error {
             PlanError::Bus(error) => Failure::from(error),
             PlanError::Package(fault) => Failure::package(path, &fault),
         })?;
         drop(waiting);
         out.say(plan.to_string().trim_end());
+        if self.allow_older {
+            plan.allow_older(|_| true);
+        }
         if plan.updates() > 0 {
             self.confirm(context, &plan)?;
         }
@@ -469,7 +486,10 @@ fn summary(
                     Bad::Left(fault) => Failure::of_device(&fault),
                     Bad::Failed(failed) => Failure::from(failed.error).leaving(Some(failed.left)),
                 };
-                out.say(format_args!("{whom}: {}: {}", program.name, failure.to_string().trim_end()));
+                // Of another machine, the plan has said it.
+                if !plan.is_of_other_machine() {
+                    out.say(format_args!("{whom}: {}: {}", program.name, failure.to_string().trim_end()));
+                }
                 value["state"] = "failed".into();
                 value["error"] = failure.value()["error"].clone();
                 failures.push(failure);

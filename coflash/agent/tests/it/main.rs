@@ -59,7 +59,7 @@ impl Devices for Fake {
         let crc = match &order.content {
             Content::Program(_, Payload::Program(file)) => file.crc(),
             Content::Program(..) => panic!("a block file"),
-            Content::Package(package) => package.programs().map(|(_, program)| program.crc()).sum(),
+            Content::Package(_, package) => package.programs().map(|(_, program)| program.crc()).sum(),
         };
         self.given.lock().unwrap().push((order.target.controller.clone(), crc));
         let _ = news.send(News::Percent(40));

@@ -448,7 +448,7 @@ impl IdentityPart {
         }
     }
 
-    const fn words(self) -> &'static str {
+    pub(crate) const fn words(self) -> &'static str {
         match self {
             Self::VendorId => "vendor-ID",
             Self::ProductCode => "product code",

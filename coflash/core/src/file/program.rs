@@ -6,7 +6,7 @@ use serde::Serialize;
 use shared_abi::block_file::{Last, ProgramVersion, FRAMING};
 use shared_abi::label::Label;
 
-use super::checksum::Checksum;
+use super::checksum::{own_crc, Checksum};
 use super::fault::{Cause, Place, ReadError};
 use super::image::Image;
 use super::label::label_of;
@@ -49,6 +49,18 @@ pub struct Program {
     pub(super) target: Option<Target>,
     pub(super) release: Option<Release>,
     pub(super) cut: Cut,
+}
+
+/// Where a program has a CRC-32 of its own, as build scripts append it: the CRC-32 from there on does not depend
+/// on what is before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OwnCrc {
+    /// Nowhere.
+    None,
+    /// Before other data: its CRC may also be that of parts of two versions.
+    Inside,
+    /// At its end, before padding at most: its CRC is that of each of its versions.
+    AtEnd,
 }
 
 /// How the dialect `block` cuts a program.
@@ -115,6 +127,17 @@ impl Program {
     pub fn crcs(&self) -> [u32; 2] {
         let other = self.checksum.other();
         [self.crc(), other.of_flash(self.start, self.size(), self.image.runs())]
+    }
+
+    /// Where it has a CRC-32 of its own.
+    #[must_use]
+    pub fn own_crc(&self) -> OwnCrc {
+        let bytes = self.flash_image();
+        match own_crc(&bytes).map(|end| &bytes[end..]) {
+            None => OwnCrc::None,
+            Some(padding) if padding.iter().all(|byte| Some(byte) == padding.first()) => OwnCrc::AtEnd,
+            Some(_) => OwnCrc::Inside,
+        }
     }
 
     /// The kind of its [CRC](Self::crc).

@@ -264,6 +264,18 @@ pub enum DeviceFault {
         /// The value now.
         is: String,
     },
+    /// The device has a newer version, and nobody has allowed an older one.
+    #[error("node {node} has {has} of {program:?}, and {gets} of the package is older: it was not written")]
+    Older {
+        /// The device.
+        node: NodeId,
+        /// The program.
+        program: String,
+        /// The version of the device.
+        has: String,
+        /// The version of the package.
+        gets: String,
+    },
     /// An earlier program of this device failed.
     #[error("{program:?} was not begun, because an earlier program of node {node} failed")]
     EarlierFailed {
@@ -286,6 +298,7 @@ impl DeviceFault {
             Self::Exchanged { .. } => BASE + 0xC,
             Self::EarlierFailed { .. } => BASE + 0xD,
             Self::Mute { .. } => BASE + 0xE,
+            Self::Older { .. } => BASE + 0xF,
         }
     }
 
@@ -302,6 +315,10 @@ impl DeviceFault {
             }
             Self::OtherDevice { .. } => "check that the right device is at this node-ID, or get the package for this machine",
             Self::Exchanged { .. } => "nothing was written to it: run the command again, which makes a new plan",
+            Self::Older { .. } => {
+                "get the newer package; if the older one is wanted, allow it: coflash flash --allow-older, a click on \
+                 the service page, allow-older = true in the agent's configuration"
+            }
             Self::EarlierFailed { .. } => "find out why that one failed, and run the command again",
         }
     }

@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
-use shared_abi::block_file::ProgramVersion;
 
 use super::fault::Fault;
 use super::manifest::{self, Entry, Identity, Manifest};
@@ -15,7 +14,7 @@ use crate::file::sealed::show::digits;
 use crate::file::sealed::{PublicKey, SealedFile, SigningKey};
 use crate::file::{self, Firmware, Format, Target};
 use crate::update::dialect::is_data;
-use crate::update::Payload;
+use crate::update::{Marks, Payload};
 use seal::wire::CERTIFICATE;
 
 /// A package whose members were checked.
@@ -26,8 +25,8 @@ pub struct Package {
     signed: Vec<u8>,
     signers: Vec<Signer>,
     programs: Vec<Payload>,
-    /// The CRCs of each: they go over its whole span, and every device is compared with them.
-    crcs: Vec<[u32; 2]>,
+    /// The marks of each: its CRC goes over its whole span, and every device is compared with it.
+    marks: Vec<Marks>,
 }
 
 /// Whether a file begins as a package: with its manifest.
@@ -85,8 +84,8 @@ impl Package {
             }
             programs.push(program(entry, member.bytes)?);
         }
-        let crcs = programs.iter().map(Payload::crcs).collect();
-        Ok(Self { manifest, signed: signed.to_vec(), signers, programs, crcs })
+        let marks = programs.iter().map(Payload::marks).collect();
+        Ok(Self { manifest, signed: signed.to_vec(), signers, programs, marks })
     }
 
     /// Checks that one of these roots has signed the package, or certified its signers. Returns the signers
@@ -115,9 +114,15 @@ impl Package {
         self.manifest.programs.iter().zip(&self.programs)
     }
 
-    /// The values that a device with this program may report.
-    pub(super) fn crcs(&self, entry: usize) -> [u32; 2] {
-        self.crcs.get(entry).copied().unwrap_or_default()
+    /// When the newest of its programs was made, in seconds since 1970 (UTC), if any says so.
+    #[must_use]
+    pub fn date(&self) -> Option<u64> {
+        self.programs.iter().filter_map(Payload::date).max()
+    }
+
+    /// What a device reports that has this program.
+    pub(super) fn marks(&self, entry: usize) -> Option<&Marks> {
+        self.marks.get(entry)
     }
 
     pub(super) fn program(&self, entry: usize) -> Option<(&Entry, &Payload)> {
@@ -227,15 +232,8 @@ pub(super) fn target(program: &Payload) -> Option<Identity> {
 /// The version of a program, if it has one.
 #[must_use]
 pub fn version(program: &Payload) -> Option<String> {
-    let version = match program {
-        Payload::Program(program) => {
-            let named = program.release().map(|release| release.version);
-            named.or_else(|| Some(ProgramVersion(program.label()?.version)))?
-        }
-        Payload::Sealed(file) if !program.is_bootloader() => ProgramVersion(file.head().version()),
-        bootloader => return Some(bootloader.bootloader()?.to_string()),
-    };
-    Some(version.to_string())
+    let bootloader = program.bootloader().map(|version| version.to_string());
+    bootloader.or_else(|| Some(program.version()?.to_string()))
 }
 
 /// The kind of a program, in words.

@@ -5,18 +5,19 @@ use std::fmt;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 
-use canopen::program::ProgramState;
-use canopen::NodeId;
+use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_DATE};
+use canopen::{Address, NodeId};
 use serde::{Serialize, Serializer};
 
 use super::fault::{DeviceFault, Fault};
 use super::manifest::Entry;
 use super::package::{version, Package};
+use crate::device::error::reported;
 use crate::device::info::{self, hex, program_info, DeviceInfo, ProgramInfo};
 use crate::device::scan::{scan, Found, ScanOptions};
 use crate::device::{Error, Session};
 use crate::json;
-use crate::update::Payload;
+use crate::update::{Installed, Marks, Payload};
 use coboot_can::Adapter;
 
 /// Why there is no plan.
@@ -71,6 +72,9 @@ pub struct Step {
     /// What is to be done.
     #[serde(serialize_with = "todo_name")]
     pub todo: Todo,
+    /// Whether the device reports the CRC of the program, and that is the CRC of each of its versions: the program
+    /// is written, because nobody knows whether the device has it.
+    pub crc_tells_nothing: bool,
 }
 
 /// What is to be done with a program of a device.
@@ -80,6 +84,8 @@ pub enum Todo {
     Has,
     /// The device gets it.
     Update,
+    /// Nothing, unless the user wants it: the device has a newer version.
+    Older,
     /// Nothing: the device is not the one of the package.
     Leave(DeviceFault),
 }
@@ -137,6 +143,7 @@ impl Todo {
         match self {
             Self::Has => "has",
             Self::Update => "update",
+            Self::Older => "older",
             Self::Leave(_) => "leave",
         }
     }
@@ -163,25 +170,43 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     let found = scan(adapter, options, cancelled)?;
     let mut plan = matched(package, &found)?;
-    // The CRC of a bootloader is not among the information about a device.
+    // The CRC of a bootloader and the date of a program are not among the information about a device.
     for device in &mut plan.devices {
         let Some(info) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
         for step in &mut device.steps {
-            let Some((_, new)) = package.program(step.entry) else { continue };
-            let Some(bootloader) = info.bootloader.as_ref().filter(|_| new.is_bootloader()) else { continue };
+            let Some((entry, new)) = package.program(step.entry) else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
-            match program_info(&mut session, bootloader.number) {
-                Ok(has) if step.todo == Todo::Update && has_bootloader(info, &has, new) => {
-                    step.todo = Todo::Has;
+            let asked = match (&step.todo, info.bootloader.as_ref().filter(|_| new.is_bootloader())) {
+                (Todo::Update | Todo::Older, Some(bootloader)) => {
+                    program_info(&mut session, bootloader.number)
+                        .map(|has| has_bootloader(info, &has, new).then_some(Todo::Has))
                 }
+                (Todo::Has, None) => is_of_other_date(&mut session, entry, package.marks(step.entry))
+                    .map(|is_other| is_other.then_some(Todo::Update)),
+                _ => Ok(None),
+            };
+            match asked {
+                Ok(todo) => step.todo = todo.unwrap_or(step.todo.clone()),
                 Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error.into()),
                 // The run asks a device again that answers no more, and says so.
-                Ok(_) | Err(_) => {}
+                Err(_) => {}
             }
         }
     }
     Ok(plan)
+}
+
+/// Whether the program that runs, with the right CRC, was made at another time: 1F52h has the date of what runs, and
+/// zeros for none.
+fn is_of_other_date(session: &mut Session<'_>, entry: &Entry, marks: Option<&Marks>) -> Result<bool, Error> {
+    let Some(wanted) = marks.map(|marks| marks.date).filter(|date| *date != [0; 2]) else { return Ok(false) };
+    let mut number = |index, sub| reported(session.read_number(Address::new(index, sub)));
+    if number(PROGRAM_CONTROL, entry.program)? != Some(ProgramState::Running as u32) {
+        return Ok(false);
+    }
+    let date = [number(PROGRAM_DATE, 1)?, number(PROGRAM_DATE, 2)?].map(Option::unwrap_or_default);
+    Ok(date != [0; 2] && date != wanted)
 }
 
 /// Matches the nodes of a scan with the programs of the package.
@@ -239,11 +264,13 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
     let mut steps: Vec<Step> = Vec::new();
     for (at, (entry, program)) in package.programs().enumerate() {
         let is_named = entry.nodes.contains(&node.get());
-        let todo = match differs(entry, node, info) {
+        let installed = package.marks(at).map_or(Installed::Other, |marks| has(info, entry, marks));
+        let todo = match differs(entry, program, node, info) {
             _ if !is_named && !entry.nodes.is_empty() => continue,
             Some(_) if !is_named => continue,
             Some(fault) => Todo::Leave(fault),
-            None if has(info, entry, package.crcs(at)) => Todo::Has,
+            None if installed == Installed::This => Todo::Has,
+            None if is_older(info, entry, program, package.marks(at)) => Todo::Older,
             None => Todo::Update,
         };
         let same = |step: &&Step| number(step) == Some(entry.program) && !matches!(step.todo, Todo::Leave(_));
@@ -256,7 +283,8 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
             });
         }
         let (from, to) = versions(info, entry, program);
-        steps.push(Step { entry: at, program: entry.name.clone(), from, to, todo });
+        let crc_tells_nothing = installed == Installed::Unknown && todo == Todo::Update;
+        steps.push(Step { entry: at, program: entry.name.clone(), from, to, todo, crc_tells_nothing });
     }
     // A package may have a program for each device that can be at a node.
     let served: Vec<Option<u8>> =
@@ -265,35 +293,45 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
     Ok(steps)
 }
 
-/// The part of the identity in which a device differs from the package.
-fn differs(entry: &Entry, node: NodeId, info: &DeviceInfo) -> Option<DeviceFault> {
-    let wanted = entry.identity?;
-    let parts = [
-        ("vendor-ID", Some(wanted.vendor)),
-        ("product code", Some(wanted.product)),
-        ("revision", wanted.revision),
-    ];
-    let mut parts = parts.into_iter().zip(info.identity);
-    parts.find(|((_, wanted), device)| wanted.is_some() && wanted != device).map(
-        |((what, wanted), device)| DeviceFault::OtherDevice {
-            node,
-            program: entry.name.clone(),
-            what,
-            device: hex(device),
-            package: hex(wanted),
-        },
-    )
+/// The part of the identity in which a device differs from the package, or from what the file itself names.
+fn differs(entry: &Entry, program: &Payload, node: NodeId, info: &DeviceInfo) -> Option<DeviceFault> {
+    let of_entry = entry.identity.and_then(|wanted| {
+        let parts = [
+            ("vendor-ID", Some(wanted.vendor)),
+            ("product code", Some(wanted.product)),
+            ("revision", wanted.revision),
+        ];
+        let mut parts = parts.into_iter().zip(info.identity);
+        let other = parts.find(|((_, wanted), device)| wanted.is_some() && wanted != device)?;
+        Some((other.0 .0, other.1, other.0 .1))
+    });
+    let of_file = || program.misfit(info.identity);
+    let of_file = || of_file().map(|(what, device, file)| (what.words(), Some(device), Some(file)));
+    let (what, device, wanted) = of_entry.or_else(of_file)?;
+    let (device, package) = (hex(device), hex(wanted));
+    Some(DeviceFault::OtherDevice { node, program: entry.name.clone(), what, device, package })
 }
 
-/// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not
-/// been released yet.
-fn has(info: &DeviceInfo, entry: &Entry, crcs: [u32; 2]) -> bool {
+/// What the device reports about the program of this number, if it has one.
+fn installed<'i>(info: &'i DeviceInfo, entry: &Entry) -> Option<&'i ProgramInfo> {
     let installed = info.programs.iter().find(|installed| installed.number == entry.program);
-    let is_there = installed.is_some_and(|installed| {
-        installed.state() != Some(ProgramState::Absent)
-            && installed.crc.is_some_and(|crc| crc != 0 && crcs.contains(&crc))
-    });
-    !info.device_type.is_bootloader() && is_there
+    installed.filter(|installed| installed.state() != Some(ProgramState::Absent))
+}
+
+/// Whether the device runs with this program. One in its bootloader has not been released yet.
+fn has(info: &DeviceInfo, entry: &Entry, marks: &Marks) -> Installed {
+    let installed = installed(info, entry).filter(|_| !info.device_type.is_bootloader());
+    installed.map_or(Installed::Other, |installed| marks.compare(installed))
+}
+
+/// Whether the device has a newer version.
+fn is_older(info: &DeviceInfo, entry: &Entry, program: &Payload, marks: Option<&Marks>) -> bool {
+    match (program.bootloader(), info.bootloader) {
+        // Major in the upper half, minor in the lower.
+        (Some(new), Some(old)) => new.0 < old.version.0,
+        (Some(_), None) => false,
+        (None, _) => marks.zip(installed(info, entry)).is_some_and(|(marks, has)| marks.is_older(has)),
+    }
 }
 
 /// Whether the device has this bootloader. The CRC of a sealed one is not known here, and an application
@@ -303,18 +341,17 @@ fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &Payload) -> bool {
     // One on trial has to be confirmed.
     let is_settled =
         old.running.is_none_or(|running| running.progress.state != shared_abi::renewal::State::Staged);
-    let is_same = match (new, has.crc) {
+    let is_same_crc = match (new, has.crc) {
         (Payload::Bootloader(_), Some(crc)) if crc != 0 => crc == new.crc(),
-        _ => Some(old.version) == new.bootloader(),
+        _ => true,
     };
-    is_settled && is_same
+    is_settled && is_same_crc && Some(old.version) == new.bootloader()
 }
 
 /// What the device has and what it gets: their versions, if both have one and these differ, and otherwise
 /// their CRCs.
 fn versions(info: &DeviceInfo, entry: &Entry, program: &Payload) -> (Option<String>, String) {
-    let installed = info.programs.iter().find(|installed| installed.number == entry.program);
-    let installed = installed.filter(|installed| installed.state() != Some(ProgramState::Absent));
+    let installed = installed(info, entry);
     let has = match info.bootloader.filter(|_| entry.is_bootloader()) {
         Some(bootloader) => Some(bootloader.version.to_string()),
         None => installed.and_then(ProgramInfo::release).map(|version| version.to_string()),
@@ -333,6 +370,22 @@ impl Plan {
     pub fn updates(&self) -> usize {
         let steps = self.devices.iter().flat_map(|device| &device.steps);
         steps.filter(|step| step.todo == Todo::Update).count()
+    }
+
+    /// Also writes what is older than what these devices have.
+    pub fn allow_older(&mut self, is_allowed: impl Fn(NodeId) -> bool) {
+        for device in self.devices.iter_mut().filter(|device| is_allowed(device.node)) {
+            let older = device.steps.iter_mut().filter(|step| step.todo == Todo::Older);
+            older.for_each(|step| step.todo = Todo::Update);
+        }
+    }
+
+    /// Whether each device at the nodes of the package is another one than there: this is another machine.
+    #[must_use]
+    pub fn is_of_other_machine(&self) -> bool {
+        let mut steps = self.devices.iter().flat_map(|device| &device.steps).peekable();
+        let is_other = |step: &Step| matches!(step.todo, Todo::Leave(DeviceFault::OtherDevice { .. }));
+        steps.peek().is_some() && steps.all(is_other)
     }
 
     /// The devices that are changed.
@@ -356,18 +409,30 @@ impl fmt::Display for Stranger {
     }
 }
 
+/// Why a program is written whose CRC the device reports.
+const CRC_TELLS_NOTHING: &str =
+    "warning: each version of this program has this CRC, because it ends with a CRC-32 of \
+     its own: nobody knows whether the device has it, so it is written";
+
 impl fmt::Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.is_of_other_machine() {
+            writeln!(f, "this is not the machine of this package")?;
+        }
         for device in &self.devices {
             let serial =
                 device.identity[3].map_or(String::new(), |serial| format!(" (serial number {serial:08X}h)"));
-            for Step { program, from, to, todo, .. } in &device.steps {
+            for Step { program, from, to, todo, crc_tells_nothing, .. } in &device.steps {
                 write!(f, "node {}: {program}: ", device.node)?;
                 let from = from.as_deref().unwrap_or("no program");
                 match todo {
                     Todo::Has => writeln!(f, "it has {to}{serial}")?,
                     Todo::Update => writeln!(f, "{from} -> {to}{serial}")?,
+                    Todo::Older => writeln!(f, "it has {from}, and {to} is older: not written{serial}")?,
                     Todo::Leave(fault) => writeln!(f, "is not written: {fault}")?,
+                }
+                if *crc_tells_nothing {
+                    writeln!(f, "  {}", CRC_TELLS_NOTHING)?;
                 }
             }
         }

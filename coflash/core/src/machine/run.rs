@@ -1,6 +1,6 @@
 //! The run: carries out a plan, program by program in the order of the package.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::Ordering;
 
 use canopen::NodeId;
@@ -14,7 +14,7 @@ use crate::device::{Error, Session};
 use crate::file::Target;
 use crate::update::event::Event;
 use crate::update::many::{flash_many, Failed, Job, ManyOptions};
-use crate::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report};
+use crate::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Known, Payload, Report};
 use coboot_can::Adapter;
 
 options! {
@@ -25,6 +25,8 @@ options! {
         pub flash: FlashOptions = FlashOptions::default(),
         /// How devices with the same program are updated at the same time.
         pub many: ManyOptions = ManyOptions::default(),
+        /// What is known of the devices from an earlier run that did not end.
+        pub known: Known = Known::default(),
     }
 }
 
@@ -73,6 +75,8 @@ pub fn run(
     on_event: &(dyn Fn(NodeId, usize, Event) + Sync),
 ) -> Vec<Outcome> {
     let mut failed: BTreeSet<NodeId> = BTreeSet::new();
+    // What is known of each device outlives each program.
+    let mut known: BTreeMap<NodeId, DeviceState> = BTreeMap::new();
     let mut outcomes = Vec::new();
     for (at, (entry, program)) in package.programs().enumerate() {
         let missing = plan.missing.iter().filter(|missing| missing.entry == at);
@@ -83,19 +87,27 @@ pub fn run(
         let mut due: Vec<(NodeId, Target)> = Vec::new();
         let mut ended: Vec<(NodeId, Result<Good, Bad>)> = Vec::new();
         for device in &plan.devices {
+            let is_the_same = |adapter: &mut dyn Adapter| {
+                let state = known.get(&device.node).copied().unwrap_or(options.known.state());
+                is_the_same(adapter, entry, device, options).map_err(|bad| bad.at_least(state))
+            };
             for step in device.steps.iter().filter(|step| step.entry == at) {
                 let (node, program) = (device.node, entry.name.clone());
                 match &step.todo {
                     // Another machine may be on the bus since then.
                     Todo::Has => {
-                        let same = is_the_same(adapter, entry, device, options);
+                        let same = is_the_same(&mut *adapter);
                         ended.push((node, same.map(|_| Good::Had)));
+                    }
+                    Todo::Older => {
+                        let (has, gets) = (step.from.clone().unwrap_or_default(), step.to.clone());
+                        ended.push((node, Err(Bad::Left(DeviceFault::Older { node, program, has, gets }))));
                     }
                     Todo::Leave(fault) => ended.push((node, Err(Bad::Left(fault.clone())))),
                     Todo::Update if failed.contains(&node) => {
                         ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));
                     }
-                    Todo::Update => match is_the_same(adapter, entry, device, options) {
+                    Todo::Update => match is_the_same(&mut *adapter) {
                         Ok(target) => due.push((node, target)),
                         Err(bad) => ended.push((node, Err(bad))),
                     },
@@ -104,7 +116,14 @@ pub fn run(
         }
         ended.extend(update(adapter, at, entry, program, &due, options, on_event));
         ended.sort_by_key(|(node, _)| *node);
-        failed.extend(ended.iter().filter(|(_, result)| result.is_err()).map(|(node, _)| *node));
+        let is_older = |bad: &Bad| matches!(bad, Bad::Left(DeviceFault::Older { .. }));
+        let bad = ended.iter().filter(|(_, result)| result.as_ref().is_err_and(|bad| !is_older(bad)));
+        failed.extend(bad.map(|(node, _)| *node));
+        let updated = ended.iter().filter_map(|(node, result)| match result {
+            Ok(Good::Updated(report)) if report.renewal.is_none() => Some((*node, report.left())),
+            _ => None,
+        });
+        known.extend(updated);
         outcomes.extend(ended.into_iter().map(|(node, result)| Outcome {
             node: Some(node),
             entry: at,
@@ -152,6 +171,18 @@ fn is_the_same(
     }
 }
 
+impl Bad {
+    /// The same of a device that is known to be in this state: it is not said to be unchanged.
+    fn at_least(self, known: DeviceState) -> Self {
+        match self {
+            Self::Failed(Failed { error, left }) if left.state == DeviceState::Untouched => {
+                Self::Failed(Failed { error, left: DeviceAfterUpdate { state: known, ..left } })
+            }
+            bad => bad,
+        }
+    }
+}
+
 /// An error before the device was changed.
 fn untouched(error: Error) -> Bad {
     let left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
@@ -177,7 +208,8 @@ fn update(
         ..options.flash
     };
     let job = |(node, target): &(NodeId, Target)| {
-        Job::new(*node, program.clone(), flash.check_target(Some(*target)))
+        let job = Job::new(*node, program.clone(), flash.check_target(Some(*target)));
+        Job { known: options.known, ..job }
     };
     let jobs: Vec<Job> = devices.iter().map(job).collect();
     let results = flash_many(adapter, &jobs, &options.many, &|number, event| {
@@ -185,6 +217,11 @@ fn update(
             on_event(job.node, at, event);
         }
     });
-    let good = |result: Result<Report, Failed>| result.map(Good::Updated).map_err(Bad::Failed);
+    let good = |result: Result<Report, Failed>| match result {
+        // The device has found that it has this bootloader.
+        Ok(report) if report.renewal.is_some_and(|renewal| renewal.unchanged) => Ok(Good::Had),
+        Ok(report) => Ok(Good::Updated(report)),
+        Err(failed) => Err(Bad::Failed(failed)),
+    };
     devices.iter().map(|(node, _)| *node).zip(results.into_iter().map(good)).collect()
 }

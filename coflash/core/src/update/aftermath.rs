@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use canopen::program::{self, FlashError};
+use canopen::program::{self, FlashError, ProgramState};
 use canopen::Address;
 
 use super::device_after::{Answers, DeviceAfterUpdate, DeviceAnswer, DeviceState};
@@ -24,7 +24,7 @@ pub(super) fn state_after(
     crcs: [u32; 2],
 ) -> DeviceAfterUpdate {
     let without = |answer| DeviceAfterUpdate { state: update.last_known(), answer };
-    let untouched = update.state == DeviceState::Untouched && !update.touched;
+    let untouched = update.known.state == DeviceState::Untouched && !update.known.touched;
     if untouched || matches!(error, Error::Adapter(_)) {
         return without(DeviceAnswer::NotAsked);
     }
@@ -65,13 +65,27 @@ fn is_not_admitted(error: &Error) -> bool {
 
 /// The state of a device, from the course of the update, its error and the device's answers.
 fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &Error) -> DeviceState {
-    let wrote = update.wrote && !is_not_admitted(error);
-    match update.state {
+    let wrote = update.known.wrote && !is_not_admitted(error);
+    match update.known.state {
         // The application was called and has stayed, or is back.
-        DeviceState::Called if !answers.running.is_bootloader() => DeviceState::Untouched,
+        DeviceState::Called | DeviceState::Begun if !answers.running.is_bootloader() => {
+            DeviceState::Untouched
+        }
+        DeviceState::Begun if answers.empty() => DeviceState::Erased,
+        DeviceState::Begun => DeviceState::Called,
         DeviceState::Erased if !answers.empty() => match answers.crc {
             // A device that erases with the first good block has received none.
-            reported @ Some(_) if !wrote && reported == update.before => update.state_before,
+            reported @ Some(_) if !wrote && reported == update.known.before => update.known.state_before,
+            // It runs, so it is whole.
+            _ if answers.control == Some(ProgramState::Running as u32)
+                && !answers.running.is_bootloader() =>
+            {
+                update.known.state_before
+            }
+            // The old program may have the same CRC.
+            reported @ Some(_) if update.known.postponed && reported == update.known.before => {
+                DeviceState::Postponed
+            }
             Some(reported) if wrote && crcs.contains(&reported) && answers.control.is_some() => {
                 DeviceState::Unreleased
             }

@@ -14,6 +14,8 @@ use crate::device::DeviceType;
 pub enum DeviceState {
     /// Nothing was changed.
     Untouched,
+    /// An earlier attempt has begun, and nobody knows how far it came.
+    Begun,
     /// The bootloader was called; the old program is intact.
     Called,
     /// The device has postponed the erase until the first good data, and has acknowledged none: the old
@@ -35,6 +37,7 @@ impl DeviceState {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Untouched => "untouched",
+            Self::Begun => "begun",
             Self::Called => "called",
             Self::Postponed => "postponed",
             Self::Erased => "erased",
@@ -49,6 +52,7 @@ impl fmt::Display for DeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Untouched => "it was not changed",
+            Self::Begun => "an earlier attempt has begun with it, and may have changed it",
             Self::Called => "it was called back to the bootloader, and its program is unchanged",
             Self::Postponed => "it erases its program with the first good data, and has acknowledged none of the new one",
             Self::Erased => "it contains no complete program",

@@ -12,7 +12,8 @@ use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Event, Note, Report, Warning};
 use super::options::FlashOptions;
 use super::payload::Payload;
-use super::pipeline::flash;
+use super::pipeline::flash_knowing;
+use super::running::Known;
 use crate::device::{Error, Session, Timing, Transfers};
 use coboot_can::{hub, Adapter, Gateway};
 
@@ -26,13 +27,15 @@ pub struct Job {
     pub file: Payload,
     /// The options.
     pub options: FlashOptions,
+    /// What is known of the device from an earlier attempt.
+    pub known: Known,
 }
 
 impl Job {
     /// An update of this device with this program.
     #[must_use]
     pub fn new(node: NodeId, file: impl Into<Payload>, options: FlashOptions) -> Self {
-        Self { node, file: file.into(), options }
+        Self { node, file: file.into(), options, known: Known::default() }
     }
 }
 
@@ -85,7 +88,8 @@ pub fn flash_many(
     // A device alone can be followed to another node-ID, which lifts need.
     if let [job] = jobs {
         let mut session = Session::new(adapter, job.node, options.timing);
-        return vec![update(&mut session, job, &job.options, options, &mut |event| on_event(0, event))];
+        let show = &mut |event| on_event(0, event);
+        return vec![update(&mut session, job, &job.options, options, &mut job.known.clone(), show)];
     }
     let numbered = || jobs.iter().enumerate();
     let programs: Vec<(usize, &Job)> = numbered().filter(|(_, job)| !job.file.is_bootloader()).collect();
@@ -93,14 +97,14 @@ pub fn flash_many(
     let all: Vec<Planned<'_>> = programs
         .into_iter()
         .zip(channels)
-        .map(|((number, job), channel)| Planned { number, job, channel })
+        .map(|((number, job), channel)| Planned { number, job, channel, known: job.known })
         .collect();
     let mut results: BTreeMap<usize, Result<Report, Failed>> = BTreeMap::new();
     let mut again: Vec<Planned<'_>> = Vec::new();
     let ends = flash_each(adapter, &all, options, on_event);
     for (plan, end) in all.into_iter().zip(ends) {
         if end.is_for_another {
-            again.push(Planned { channel: None, ..plan });
+            again.push(Planned { channel: None, known: end.known, ..plan });
         }
         results.insert(plan.number, end.result);
     }
@@ -108,7 +112,7 @@ pub fn flash_many(
     results.extend(again.iter().map(|plan| plan.number).zip(ends.into_iter().map(|end| end.result)));
     let mut fate = Fate::default();
     for (number, job) in numbered().filter(|(_, job)| job.file.is_bootloader()) {
-        let plan = [Planned { number, job, channel: None }];
+        let plan = [Planned { number, job, channel: None, known: job.known }];
         let alone = ManyOptions { at_once: 1, ..options.clone() };
         let renew = || flash_each(adapter, &plan, &alone, on_event).into_iter().map(|end| end.result).next();
         results.extend(fate.of(job, renew).map(|result| (number, result)));
@@ -144,11 +148,15 @@ struct Planned<'j> {
     number: usize,
     job: &'j Job,
     channel: Option<Channel>,
+    /// What is known of the device before this attempt.
+    known: Known,
 }
 
 /// The end of an attempt.
 struct End {
     result: Result<Report, Failed>,
+    /// What is known of the device after it.
+    known: Known,
     /// The device gets another attempt, without the others.
     is_for_another: bool,
 }
@@ -184,12 +192,13 @@ fn flash_each(
     };
     let conversation = |plan: &Planned<'_>| {
         let (number, job, all, timing) = (plan.number, plan.job.clone(), options.clone(), timing(plan));
+        let mut known = plan.known;
         let act = move |port: &mut hub::Port| {
             let mut session = Session::new(port, job.node, timing);
             session.share_with(at_once as u32);
             let one = FlashOptions { follow: false, ..job.options };
             let (mut done, mut was_in_group) = (None, false);
-            let result = update(&mut session, &job, &one, &all, &mut |event| match event {
+            let result = update(&mut session, &job, &one, &all, &mut known, &mut |event| match event {
                 Event::Done(_) => done = Some(event),
                 event => {
                     was_in_group |= matches!(event, Event::Note(Note::Together { .. }));
@@ -209,7 +218,7 @@ fn flash_each(
                 (_, Some(done)) => on_event(number, done),
                 _ => {}
             }
-            End { result, is_for_another }
+            End { result, known, is_for_another }
         };
         let act: hub::Act<'_, _> = Box::new(act);
         hub::Conversation { node: plan.job.node, channel: plan.channel, act }
@@ -230,7 +239,8 @@ pub fn flash_in_turn(
 ) -> Vec<Result<Report, Failed>> {
     let mut one = |(number, job): (usize, &Job)| {
         let mut session = Session::through(&mut *gateway, job.node, options.timing);
-        update(&mut session, job, &job.options, options, &mut |event| on_event(number, event))
+        let show = &mut |event| on_event(number, event);
+        update(&mut session, job, &job.options, options, &mut job.known.clone(), show)
     };
     let mut fate = Fate::default();
     let each = |(number, job): (usize, &Job)| {
@@ -249,12 +259,13 @@ fn update(
     job: &Job,
     one: &FlashOptions,
     all: &ManyOptions,
+    known: &mut Known,
     on_event: &mut dyn FnMut(Event),
 ) -> Result<Report, Failed> {
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
-    let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
-    let result = flash(session, &job.file, one, &mut |event| {
+    let mut left = DeviceAfterUpdate { state: known.state(), answer: DeviceAnswer::NotAsked };
+    let result = flash_knowing(session, &job.file, one, known, &mut |event| {
         left = event.left().unwrap_or(left);
         on_event(event);
     });

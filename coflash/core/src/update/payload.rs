@@ -5,10 +5,15 @@ use std::sync::Arc;
 
 use canopen::program::FlashError;
 use seal::wire::BOOTLOADER;
+use shared_abi::block_file::{fits, Difference, ProgramVersion};
+use shared_abi::date;
 use shared_abi::ram_image::Version;
 
-use crate::device::error::flash_error_number;
+use crate::device::error::{flash_error_number, IdentityPart};
+use crate::device::info::{Identity, ProgramInfo};
 use crate::device::Form;
+use crate::file::checksum::is_of_self_checked;
+use crate::file::program::OwnCrc;
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Format};
 use crate::file::sealed::{Refusal, SealedFile};
@@ -86,6 +91,70 @@ impl Payload {
         }
     }
 
+    /// The part of an identity (1018h) in which the device is not the one that the file names: its device's value
+    /// and that of the file. A value that the device does not report (`None`) cannot differ.
+    #[must_use]
+    pub fn misfit(&self, [vendor, product, ..]: Identity) -> Option<(IdentityPart, u32, u32)> {
+        let targets = match self {
+            Self::Program(program) => program.targets(),
+            Self::Sealed(file) => [Some(file.target()), None],
+            // The device itself judges whether it can be its bootloader.
+            Self::Bootloader(_) => [None; 2],
+        };
+        targets.into_iter().flatten().find_map(|Target { vendor_id, product_code }| {
+            let file = (vendor_id, product_code);
+            let device = (vendor.unwrap_or(vendor_id), product.unwrap_or(product_code));
+            let difference = match self {
+                // In a manifest, 0 is a normal value.
+                Self::Sealed(_) if file.0 != device.0 => Some(Difference::VendorId),
+                Self::Sealed(_) => (file != device).then_some(Difference::ProductCode),
+                _ => fits(file, device).err(),
+            };
+            Some(match difference? {
+                Difference::VendorId => (IdentityPart::VendorId, device.0, file.0),
+                Difference::ProductCode => (IdentityPart::ProductCode, device.1, file.1),
+            })
+        })
+    }
+
+    /// The version of a program, if its file or its label names one; `None` for a bootloader.
+    #[must_use]
+    pub fn version(&self) -> Option<ProgramVersion> {
+        let versions = match self {
+            Self::Program(program) => {
+                [program.release().map(|release| release.version.0), program.label().map(|it| it.version)]
+            }
+            Self::Sealed(file) if !self.is_bootloader() => [Some(file.head().version()), None],
+            Self::Sealed(_) | Self::Bootloader(_) => [None; 2],
+        };
+        versions.into_iter().flatten().find(|version| *version != 0).map(ProgramVersion)
+    }
+
+    /// When it was made, in seconds since 1970 (UTC), if its file or its label says so.
+    #[must_use]
+    pub fn date(&self) -> Option<u64> {
+        let dates = match self {
+            Self::Program(program) => {
+                [program.release().map(|it| it.date), program.label().map(|it| it.date.into())]
+            }
+            Self::Sealed(file) => [Some(file.head().created()), None],
+            Self::Bootloader(_) => [None; 2],
+        };
+        dates.into_iter().flatten().find(|date| *date != 0)
+    }
+
+    /// What a device reports that has this program.
+    #[must_use]
+    pub fn marks(&self) -> Marks {
+        let tells_nothing = match self {
+            Self::Program(program) => program.own_crc() == OwnCrc::AtEnd,
+            Self::Sealed(file) => is_of_self_checked(file.head().crc()),
+            Self::Bootloader(_) => false,
+        };
+        let date = self.date().map_or([0; 2], |date| date::days_and_milliseconds(date::of_control(date)));
+        Marks { crcs: self.crcs(), tells_nothing, version: self.version(), date }
+    }
+
     /// The version of a bootloader; `None` for a program.
     #[must_use]
     pub fn bootloader(&self) -> Option<Version> {
@@ -113,6 +182,49 @@ impl Payload {
             Self::Sealed(file) => Cow::Borrowed(file.bytes()),
             Self::Bootloader(image) => Cow::Borrowed(image.bytes()),
         }
+    }
+}
+
+/// What a device reports that has a program, for the comparison with many devices. One value is never enough where
+/// another one is known on both sides.
+#[derive(Clone, Copy, Debug)]
+pub struct Marks {
+    crcs: [u32; 2],
+    /// Whether the CRC is the same for each version of the program.
+    tells_nothing: bool,
+    version: Option<ProgramVersion>,
+    /// The elements of 1F52h; zeros for none.
+    pub(crate) date: [u32; 2],
+}
+
+/// What a device's values say about whether it has a program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Installed {
+    /// It has another one, or none.
+    Other,
+    /// It has this one.
+    This,
+    /// It reports its CRC, which is that of each of its versions: nobody knows.
+    Unknown,
+}
+
+impl Marks {
+    /// Compares CRC and version.
+    #[must_use]
+    pub fn compare(&self, has: &ProgramInfo) -> Installed {
+        let crc = has.crc.filter(|crc| *crc != 0);
+        let is_other_version = self.version.zip(has.release()).is_some_and(|(file, device)| file != device);
+        match crc.is_some_and(|crc| self.crcs.contains(&crc)) && !is_other_version {
+            false => Installed::Other,
+            true if self.tells_nothing => Installed::Unknown,
+            true => Installed::This,
+        }
+    }
+
+    /// Whether the program is older than what the device has, where both versions are known.
+    #[must_use]
+    pub fn is_older(&self, has: &ProgramInfo) -> bool {
+        self.version.zip(has.release()).is_some_and(|(file, device)| file.is_before(device))
     }
 }
 

@@ -167,6 +167,13 @@ pub enum Warning {
         /// What happened.
         why: String,
     },
+    /// The device has a newer version of the program.
+    Older {
+        /// The version of the device.
+        has: String,
+        /// The version of the file.
+        gets: String,
+    },
     /// The part that the device had does not fit the file: everything is sent again.
     BeginsAgain {
         /// What the device found.
@@ -264,6 +271,9 @@ impl fmt::Display for Warning {
             }
             Self::Apart { why } => {
                 write!(f, "it did not get through with the others ({why}): updating it alone")
+            }
+            Self::Older { has, gets } => {
+                write!(f, "the device has version {has}, and the file is older: {gets}")
             }
             Self::BeginsAgain { why } => {
                 write!(f, "what the device had of this program is not usable ({why}): sending everything")

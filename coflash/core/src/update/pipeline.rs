@@ -4,19 +4,24 @@
 //! Step 1, making the program, is [`convert`](mod@crate::file::convert); the dialect cuts it in blocks. All
 //! checks that are possible before the device is changed are made there and in `admission`.
 
+use canopen::program::PROGRAM_VERSION;
+use canopen::Address;
+use shared_abi::block_file::ProgramVersion;
+
 use super::admission::admit;
 use super::aftermath::state_after;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::Downloaded;
 use super::entry::{self, enter};
-use super::event::{Done, Event, Phase, Report};
+use super::event::{Done, Event, Note, Phase, Report, Warning};
 use super::options::FlashOptions;
 use super::payload::Payload;
 use super::reach::{find, reach};
 use super::report::Renewal;
-use super::running::{give_back, reporting_silence, RunningUpdate};
+use super::running::{give_back, reporting_silence, Known, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
+use crate::device::error::reported;
 use crate::device::{Dialect, Error, Session};
 
 /// Updates a device: detects what runs there, calls the bootloader, and gives it the program, the sealed
@@ -39,16 +44,29 @@ pub fn flash(
     options: &FlashOptions,
     on_event: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    let file = &file.into();
+    flash_knowing(session, &file.into(), options, &mut Known::default(), on_event)
+}
+
+/// [`flash`] of a device of which something is known from an earlier attempt; what is known after this one.
+pub(super) fn flash_knowing(
+    session: &mut Session<'_>,
+    file: &Payload,
+    options: &FlashOptions,
+    known: &mut Known,
+    on_event: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
     let (result, node, transfers) = reporting_silence(session, on_event, |session, on_event| {
-        let mut update = RunningUpdate::new(session.node(), *options, on_event);
+        let mut update = RunningUpdate::new(session.node(), *options, known, on_event);
         let result = procedure(session, file, &mut update);
         let left = match &result {
-            Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
+            Ok(_) => DeviceAfterUpdate { state: update.known.state, answer: DeviceAnswer::NotAsked },
             Err(error) => state_after(session, error, &update, options.program, file.crcs()),
         };
         if let Some(taken) = update.mastership.take() {
             give_back(session, taken, &mut |event| update.report(event));
+        }
+        if let DeviceAnswer::Given(_) = left.answer {
+            update.known.state = left.state;
         }
         update.report(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())
@@ -57,6 +75,22 @@ pub fn flash(
     session.talk_to(node);
     session.transfer_by(transfers);
     result
+}
+
+/// Warns of a program that is older than that of the device, which reports its version in 2005h.
+fn warn_of_older(
+    session: &mut Session<'_>,
+    file: &Payload,
+    dialect: Dialect,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(), Error> {
+    let Some(gets) = file.version().filter(|_| dialect == Dialect::Block) else { return Ok(()) };
+    let at = Address::new(PROGRAM_VERSION, update.options.program);
+    let has = ProgramVersion(reported(session.read_number(at))?.unwrap_or(0));
+    if gets.is_before(has) {
+        update.report(Warning::Older { has: has.to_string(), gets: gets.to_string() }.into());
+    }
+    Ok(())
 }
 
 /// [`flash`] without the actions that are necessary after success and failure alike.
@@ -69,6 +103,11 @@ fn procedure(
     reach(session, update, |session, update| {
         let found = find(session, update)?;
         let admission = admit(session, file, found.dialect, &update.options)?;
+        // The target may be that of the device itself, as a plan has found it: only a file says more.
+        if let Some(target) = update.options.check_target.filter(|target| file.target() == Some(*target)) {
+            update.report(Note::TargetRight(target).into());
+        }
+        warn_of_older(session, file, found.dialect, update)?;
         enter(session, file, found, admission, update)
     })?;
     let (dialect, options) = (update.dialect, update.options);

@@ -1,7 +1,7 @@
 //! Step 2: the search for a device.
 
 use super::catch::search;
-use super::event::{Event, Note, Phase};
+use super::event::{Event, Phase};
 use super::running::RunningUpdate;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, DeviceType, Dialect, Error, Session};
@@ -60,7 +60,6 @@ pub(super) fn find(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) ->
     update.report(Event::Found(running));
     if let Some(target) = update.options.check_target {
         check_target(session, target)?;
-        update.report(Note::TargetRight(target).into());
     }
     let dialect = match update.options.dialect {
         Some(dialect) => dialect,

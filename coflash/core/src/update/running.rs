@@ -34,18 +34,11 @@ pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, on_event: 
     }
 }
 
-/// A running update.
-pub(super) struct RunningUpdate<'t> {
-    /// What the user wants.
-    pub(super) options: FlashOptions,
-    /// The node at its start: a lift's bootloader has another one.
-    pub(super) original: NodeId,
-    /// The dialect of the bootloader, as far as it is known.
-    pub(super) dialect: Dialect,
+/// What is known of a device, over all attempts of one order: it outlives each change of strategy.
+#[derive(Clone, Copy, Debug)]
+pub struct Known {
     /// The state of the device so far.
     pub(super) state: DeviceState,
-    /// The program that was called back to the bootloader for this update.
-    pub(super) called: Option<u8>,
     /// Whether any action may have changed the device.
     pub(super) touched: bool,
     /// The state before the erase.
@@ -56,6 +49,42 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) postponed: bool,
     /// Whether the device may contain a part of the new program.
     pub(super) wrote: bool,
+}
+
+impl Default for Known {
+    /// Nothing was done.
+    fn default() -> Self {
+        let state = DeviceState::Untouched;
+        Self { state, touched: false, state_before: state, before: None, postponed: false, wrote: false }
+    }
+}
+
+impl Known {
+    /// Of a device with which an earlier attempt has begun, of which nothing else is known.
+    #[must_use]
+    pub fn begun() -> Self {
+        Self { state: DeviceState::Begun, ..Self::default() }
+    }
+
+    /// The state of the device so far.
+    #[must_use]
+    pub const fn state(&self) -> DeviceState {
+        self.state
+    }
+}
+
+/// A running update.
+pub(super) struct RunningUpdate<'t> {
+    /// What the user wants.
+    pub(super) options: FlashOptions,
+    /// The node at its start: a lift's bootloader has another one.
+    pub(super) original: NodeId,
+    /// The dialect of the bootloader, as far as it is known.
+    pub(super) dialect: Dialect,
+    /// What is known of the device.
+    pub(super) known: &'t mut Known,
+    /// The program that was called back to the bootloader for this update.
+    pub(super) called: Option<u8>,
     /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
     /// The devices with which it gets its data together, as reported.
@@ -68,19 +97,19 @@ pub(super) struct RunningUpdate<'t> {
 }
 
 impl<'t> RunningUpdate<'t> {
-    /// An update of this node that has not done anything yet.
-    pub(super) fn new(original: NodeId, options: FlashOptions, on_event: &'t mut dyn FnMut(Event)) -> Self {
+    /// An attempt to update this node.
+    pub(super) fn new(
+        original: NodeId,
+        options: FlashOptions,
+        known: &'t mut Known,
+        on_event: &'t mut dyn FnMut(Event),
+    ) -> Self {
         Self {
             options,
             original,
             dialect: Dialect::Block,
-            state: DeviceState::Untouched,
+            known,
             called: None,
-            touched: false,
-            state_before: DeviceState::Untouched,
-            before: None,
-            postponed: false,
-            wrote: false,
             mastership: None,
             together: 0,
             disturbed: false,
@@ -89,26 +118,37 @@ impl<'t> RunningUpdate<'t> {
         }
     }
 
+    /// Records that the application is called back: this program runs, if the device says which one.
+    pub(super) fn calls(&mut self, running: Option<u8>) {
+        let known = &mut *self.known;
+        // A program that runs is complete, whatever an earlier attempt was about to do.
+        let runs = running == Some(self.options.program) && known.state == DeviceState::Erased;
+        if runs || matches!(known.state, DeviceState::Untouched | DeviceState::Begun) {
+            (known.state, known.wrote) = (DeviceState::Called, false);
+        }
+    }
+
     /// Records that the erase is about to start; `before` is the value of 1F56h, if it was read.
     pub(super) fn erases(&mut self, before: Option<u32>) {
-        self.touched = true;
-        if self.state != DeviceState::Erased {
-            self.state_before = std::mem::replace(&mut self.state, DeviceState::Erased);
-            self.before = before;
+        let known = &mut *self.known;
+        known.touched = true;
+        if known.state != DeviceState::Erased {
+            known.state_before = std::mem::replace(&mut known.state, DeviceState::Erased);
+            known.before = before;
         }
     }
 
     /// Records that the device has refused the erase.
     pub(super) fn erases_not(&mut self) {
-        if self.state == DeviceState::Erased && !self.wrote {
-            self.state = self.state_before;
+        if self.known.state == DeviceState::Erased && !self.known.wrote {
+            self.known.state = self.known.state_before;
         }
     }
 
     /// The state as far as it is known without an answer of the device.
     pub(super) fn last_known(&self) -> DeviceState {
-        match self.state {
-            DeviceState::Erased if self.postponed => DeviceState::Postponed,
+        match self.known.state {
+            DeviceState::Erased if self.known.postponed => DeviceState::Postponed,
             state => state,
         }
     }
@@ -116,7 +156,9 @@ impl<'t> RunningUpdate<'t> {
     /// Reports an event.
     pub(super) fn report(&mut self, event: Event) {
         match &event {
-            Event::Phase(Phase::Erased { took }) => self.postponed = *took < PUT_OFF && !self.wrote,
+            Event::Phase(Phase::Erased { took }) => {
+                self.known.postponed = *took < PUT_OFF && !self.known.wrote
+            }
             Event::Note(Note::Together { devices }) if self.together == *devices => return,
             Event::Note(Note::Together { devices }) => self.together = *devices,
             Event::Warning(Warning::GroupDisturbed) if std::mem::replace(&mut self.disturbed, true) => return,

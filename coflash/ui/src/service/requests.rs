@@ -10,6 +10,7 @@ use axum::response::Response;
 use axum::routing::{get, post};
 use axum::{Extension, Router};
 use canopen::NodeId;
+use coflash_core::file::inspect::Date;
 use coflash_core::machine::version;
 use serde::Deserialize;
 use serde_json::json;
@@ -76,6 +77,7 @@ async fn describe(State(site): State<Site>, Extension(station): Extension<Arc<St
             "file": service.file,
             "name": manifest.name,
             "release": manifest.release,
+            "date": service.package.date().map(|date| Date(date).to_string()),
             "signature": signature,
             "programs": programs.collect::<Vec<_>>(),
         },
@@ -146,7 +148,8 @@ async fn update(
     if let Some(node) = nodes.difference(&due).next() {
         return Err(bad(format!("the plan writes nothing to node {node}"), "choose devices of the plan"));
     }
-    if plan.devices.is_empty() || (nodes.is_empty() && !due.is_empty()) {
+    let is_needed = plan.updates() > 0;
+    if plan.devices.is_empty() || (nodes.is_empty() && is_needed) {
         return Err(bad("no device is chosen", "choose one of the plan"));
     }
     site.shared.begin(Update { station, number, plan, nodes, unlock, entered })?;

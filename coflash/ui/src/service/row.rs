@@ -50,6 +50,8 @@ pub(super) struct Step {
     pub(super) from: Option<String>,
     pub(super) to: String,
     pub(super) state: RowState,
+    /// Whether it is written because its CRC is that of each of its versions.
+    pub(super) crc_tells_nothing: bool,
 }
 
 /// The state of a device or of one of its programs, with its key in the table.
@@ -62,6 +64,9 @@ pub(super) enum RowState {
     /// It would get its program.
     #[serde(rename = "state-due")]
     Due,
+    /// It has a newer program, and gets the older one if the user wants it.
+    #[serde(rename = "state-older")]
+    Older,
     /// It would get its program, and the user has left it out.
     #[serde(rename = "state-left-out")]
     LeftOut,
@@ -86,8 +91,10 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             state: match step.todo {
                 Todo::Has => RowState::Has,
                 Todo::Update => RowState::Due,
+                Todo::Older => RowState::Older,
                 Todo::Leave(_) => RowState::Failed,
             },
+            crc_tells_nothing: step.crc_tells_nothing,
         });
         let mut row = Row {
             node: Some(device.node.get()),
@@ -95,8 +102,9 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             identity: device.identity,
             steps: steps.collect(),
             trouble: device.steps.iter().find_map(|step| match &step.todo {
-                Todo::Leave(fault) => Some(trouble::of_device(fault)),
-                Todo::Has | Todo::Update => None,
+                // Of another machine it is said once.
+                Todo::Leave(fault) if !plan.is_of_other_machine() => Some(trouble::of_device(fault)),
+                _ => None,
             }),
             ..Row::default()
         };
@@ -129,7 +137,8 @@ pub(super) fn others(plan: &Plan) -> Vec<Other> {
 impl Row {
     /// The state of the device, from those of its programs.
     fn sum(&mut self) {
-        let all = [RowState::Due, RowState::Failed, RowState::Updated, RowState::Has];
+        // Who chooses the device chooses all of its programs.
+        let all = [RowState::Older, RowState::Due, RowState::Failed, RowState::Updated, RowState::Has];
         let first = all.into_iter().find(|state| self.steps.iter().any(|step| step.state == *state));
         self.state = first.unwrap_or(self.state);
     }
@@ -138,7 +147,7 @@ impl Row {
     pub(super) fn choose(&mut self, is_chosen: bool) {
         let next = if is_chosen { RowState::Waiting } else { RowState::LeftOut };
         let due = self.steps.iter_mut().map(|step| &mut step.state).chain([&mut self.state]);
-        due.filter(|state| **state == RowState::Due).for_each(|state| *state = next);
+        due.filter(|state| matches!(state, RowState::Due | RowState::Older)).for_each(|state| *state = next);
     }
 
     /// Shows how far its update is.

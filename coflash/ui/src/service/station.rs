@@ -136,7 +136,7 @@ impl Station {
             }
             Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
         }
-        let due = rows.iter().filter(|row| row.state == RowState::Due).count();
+        let due = rows.iter().filter(|row| matches!(row.state, RowState::Due | RowState::Older)).count();
         if matches!(own.stage, Stage::Working(_)) {
             rows.iter_mut().for_each(|row| row.advance(&shown.updates));
         }
@@ -160,6 +160,9 @@ impl Station {
             (Stage::Planned { .. }, Connection::Open) if due > 0 => ("planned-bad", Some("hint-planned-bad")),
             (Stage::Planned { plan, .. }, Connection::Open) if plan.devices.is_empty() => {
                 ("none", Some("hint-none"))
+            }
+            (Stage::Planned { plan, .. }, Connection::Open) if plan.is_of_other_machine() => {
+                ("other-machine", Some("hint-other-machine"))
             }
             (Stage::Planned { .. }, Connection::Open) if rows.iter().all(is_good) => {
                 ("complete", Some("hint-good"))

@@ -54,6 +54,7 @@ pub(super) fn of_device(fault: &DeviceFault) -> Message {
             .value("found", found),
         DeviceFault::OtherDevice { .. } => Message::new("trouble-other-device"),
         DeviceFault::Exchanged { .. } => Message::new("trouble-exchanged"),
+        DeviceFault::Older { .. } => Message::new("state-older"),
         DeviceFault::EarlierFailed { .. } => Message::new("trouble-earlier"),
         // The library may have more of them one day.
         _ => Message::new("trouble-other"),
@@ -93,7 +94,7 @@ const fn left(state: DeviceState) -> &'static str {
     match state {
         DeviceState::Untouched => "left-untouched",
         DeviceState::Called => "left-old",
-        DeviceState::Postponed => "left-unknown",
+        DeviceState::Postponed | DeviceState::Begun => "left-unknown",
         DeviceState::Erased => "left-none",
         DeviceState::Written | DeviceState::Unreleased | DeviceState::Released => "left-new",
     }

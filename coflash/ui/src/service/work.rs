@@ -95,9 +95,9 @@ pub(super) struct Update {
     pub(super) entered: Entered,
 }
 
-/// Whether a plan has something to write to this device.
+/// Whether a plan has something that can be written to this device.
 pub(super) fn is_due(device: &machine::Device) -> bool {
-    device.steps.iter().any(|step| step.todo == Todo::Update)
+    device.steps.iter().any(|step| matches!(step.todo, Todo::Update | Todo::Older))
 }
 
 impl Update {
@@ -115,7 +115,10 @@ impl Update {
     fn chosen(&self) -> Plan {
         let Plan { devices, missing, foreign } = (*self.plan).clone();
         let is_in = |device: &machine::Device| !is_due(device) || self.nodes.contains(&device.node);
-        Plan { devices: devices.into_iter().filter(is_in).collect(), missing, foreign }
+        let mut plan = Plan { devices: devices.into_iter().filter(is_in).collect(), missing, foreign };
+        // The user has chosen them.
+        plan.allow_older(|_| true);
+        plan
     }
 }
 

@@ -17,6 +17,7 @@ use crate::file::block_file::{Block as FileBlock, BlockFile, FRAMING};
 use crate::file::checksum::Checksum;
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
+use crate::file::program::{OwnCrc, Program};
 use crate::file::sealed::SealedFile;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, RepeatReason, Warning};
@@ -53,6 +54,7 @@ impl Procedure for Block {
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
         }
+        let is_mixed_unseen = || matches!(file, Payload::Program(program) if is_mixed_unseen(program));
         let (file, is_sealed) = match file {
             Payload::Program(program) => (BlockFile::of(program), false),
             Payload::Bootloader(_) => return procedure::download(self, session, file, update),
@@ -69,16 +71,16 @@ impl Procedure for Block {
         let most = if in_group { usize::MAX } else { file.size() as usize / JOINED_PARTS };
         let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size.min(most)));
         let file = Cut { own: &file, joined: joined.as_ref() };
-        let sent = send_verified(session, file, crcs, &mut in_group, update);
+        let sent = send_verified(session, file, &is_mixed_unseen, crcs, &mut in_group, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
         }
         let (repeats, took) = sent?;
         if is_sealed {
-            update.state = DeviceState::Written;
+            update.known.state = DeviceState::Written;
             return Ok(Downloaded { repeats, took, released: None, renewal: None });
         }
-        update.state = DeviceState::Unreleased;
+        update.known.state = DeviceState::Unreleased;
         if !options.start {
             update.report(Phase::NotReleased.into());
             return Ok(Downloaded { repeats, took, released: Some(false), renewal: None });
@@ -87,7 +89,7 @@ impl Procedure for Block {
             trial::run(session, update)?;
         }
         steps::release(session, number, &mut |event| update.report(event))?;
-        update.state = DeviceState::Released;
+        update.known.state = DeviceState::Released;
         Ok(Downloaded { repeats, took, released: Some(true), renewal: None })
     }
 }
@@ -173,11 +175,18 @@ impl PartialDownload {
     }
 }
 
+/// Whether a part of another version and the rest of this one may have the CRC of this one, which is all that the
+/// device compares at the end. A date in block 0, whose CRC the device has kept, tells the versions apart.
+fn is_mixed_unseen(program: &Program) -> bool {
+    program.own_crc() != OwnCrc::None && program.release().is_none_or(|release| release.date == 0)
+}
+
 /// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off, unless
 /// the device has refused something since; if the device's part of it proves to be wrong, everything is sent.
 fn send_verified(
     session: &mut Session<'_>,
     file: Cut<'_>,
+    is_mixed_unseen: &dyn Fn() -> bool,
     crcs: [u32; 2],
     in_group: &mut bool,
     update: &mut RunningUpdate<'_>,
@@ -187,6 +196,11 @@ fn send_verified(
     let mut partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
     // Some bootloaders count the block that they refused last: what follows it would cost the old program.
     if partial.is_some() && session.status(number)?.error.is_some() {
+        partial = None;
+    }
+    if partial.is_some() && is_mixed_unseen() {
+        let why = "it may be of another version, which has the same CRC: the program has a CRC-32 of its own";
+        update.report(Warning::BeginsAgain { why: why.to_owned() }.into());
         partial = None;
     }
     let mut all = |from, update: &mut RunningUpdate<'_>| {
@@ -221,7 +235,7 @@ fn send(
         let total = file.own.size() as usize;
         let done = partial.end.saturating_sub(file.own.start()) as usize;
         // The record of the old program goes with the first good data.
-        update.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
+        update.known.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
         update.report(Phase::GoingOn { done: done.min(total), total }.into());
     } else if let Err(error) = steps::erase(session, number, &mut |event| update.report(event)) {
         if error.is_refusal() {
@@ -278,9 +292,9 @@ fn send_blocks(
         // nothing.
         let is_refused = sent.as_ref().is_err_and(Error::refuses_first_blocks);
         let is_split = matches!(sent, Ok(Sent { split: true, .. }));
-        update.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
+        update.known.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
         let sent = sent?;
-        update.postponed &= block.number == NUMBER_CONTROL || sent.split;
+        update.known.postponed &= block.number == NUMBER_CONTROL || sent.split;
         repeats += sent.repeats;
         if sent.by_other_crc {
             checksum = checksum.other();

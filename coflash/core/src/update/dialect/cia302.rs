@@ -7,7 +7,6 @@ use canopen::Address;
 use super::procedure::Procedure;
 use crate::device::error::absent;
 use crate::device::{Dialect, Error, Session};
-use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
 use crate::update::reach::Found;
 use crate::update::running::RunningUpdate;
@@ -24,7 +23,7 @@ impl Procedure for Cia302 {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         if !found.running.is_bootloader() {
-            update.state = DeviceState::Called;
+            update.calls(None);
             stop_program(session, update.options.program, update)?;
         }
         update.report(Note::Dialect { dialect: self.0 }.into());
@@ -44,6 +43,7 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
         // The bootloader is already running, or the device does not report it.
         return Ok(());
     };
+    update.calls(Some(running));
     update.called = Some(running);
     let at = Address::new(program::PROGRAM_CONTROL, running);
     update.report(Phase::CallingBack.into());

@@ -11,12 +11,11 @@ use crate::device::flying_master::{self, Asked};
 use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
-use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, Warning};
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
 use crate::update::reach::Found;
-use crate::update::running::RunningUpdate;
+use crate::update::running::{Known, RunningUpdate};
 use crate::update::steps::{await_program, reset_program, settle};
 
 /// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
@@ -104,7 +103,7 @@ fn unlock_bootloader(
     if node != lift {
         unlock(session, password)?;
         update.report(Note::Unlocked.into());
-        update.state = DeviceState::Called;
+        update.calls(Some(LIFT_PROGRAM));
         update.called = Some(LIFT_PROGRAM);
         update.report(Phase::CallingBack.into());
         match reset_program(session, LIFT_PROGRAM) {
@@ -212,7 +211,7 @@ pub fn read_locked(
     unlock_bootloader(
         session,
         password,
-        &mut RunningUpdate::new(original, FlashOptions::default(), on_event),
+        &mut RunningUpdate::new(original, FlashOptions::default(), &mut Known::default(), on_event),
     )?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {

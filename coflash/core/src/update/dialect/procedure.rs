@@ -118,7 +118,7 @@ pub(super) fn call_back(
         return Ok(found.dialect);
     }
     let program = steps::running_program(session, update.options.program)?;
-    update.state = DeviceState::Called;
+    update.calls(program);
     update.called = Some(program.unwrap_or(steps::CALL_BACK));
     update.report(Phase::CallingBack.into());
     let running = steps::call_back(session)?;
@@ -150,7 +150,7 @@ pub(super) fn download(
     let content = file.encoded(update.dialect.form());
     let repeats = send(procedure, session, number, &content, Doing::Program, update)?;
     let took = session.now().saturating_sub(began);
-    update.state = DeviceState::Written;
+    update.known.state = DeviceState::Written;
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
@@ -188,15 +188,15 @@ pub(super) fn send(
         let node = session.node();
         let mut long = session.with(node, slow);
         let mut progress = |part: u32| {
-            update.wrote |= part > 0;
-            update.postponed &= part == 0;
+            update.known.wrote |= part > 0;
+            update.known.postponed &= part == 0;
             update.report(Event::Progress { done: part as usize, total });
         };
         let sent = long.write(at, content, doing, &mut progress);
         let transfers = long.transfers();
         session.transfer_by(transfers);
         // Data without an answer may have arrived.
-        update.wrote |= !matches!(sent, Err(Error::Refused { .. }));
+        update.known.wrote |= !matches!(sent, Err(Error::Refused { .. }));
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }

@@ -59,7 +59,7 @@ impl Procedure for Renew {
         file: &Payload,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        (update.state, update.touched) = (DeviceState::Called, true);
+        (update.known.state, update.known.touched) = (DeviceState::Called, true);
         let result = renew(session, file, update);
         // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in
         // a device that is silent; the next power-on starts it there.
@@ -73,7 +73,7 @@ impl Procedure for Renew {
         if let Some(running) = running {
             update.report(Phase::Started(running).into());
         }
-        update.state = DeviceState::Untouched;
+        update.known.state = DeviceState::Untouched;
         let Renewal { repeats, transfer: took, .. } = renewal;
         Ok(Downloaded { repeats, took, released: None, renewal: Some(Renewal { running, ..renewal }) })
     }
@@ -102,7 +102,7 @@ fn renew(
     let (mut repeats, mut transfer) = (0, Duration::ZERO);
     let unchanged =
         Renewal { number, from, to, unchanged: true, repeats, transfer, took: Duration::ZERO, running: None };
-    let is_same = is_same(session, file, number)?;
+    let is_same = from == to && is_same(session, file, number)?;
     let is_open = running.origin == Origin::Trial && running.state == State::Staged;
     if is_same && running.state != State::Staged && !update.options.force {
         return Ok(unchanged);

@@ -6,14 +6,17 @@ use std::sync::{Arc, Mutex};
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coflash_core::device::scan::ScanOptions;
+use coflash_core::file::checksum::CRC as CRC32;
+use coflash_core::file::convert::{program_of, Label, Options};
+use coflash_core::file::{block_file, raw, Firmware};
 use coflash_core::machine::{
-    plan, run, Bad, DeviceFault, Good, Outcome, Package, Plan, PlanError, RunOptions, Todo,
+    make, plan, run, Bad, DeviceFault, Good, Outcome, Package, Part, Plan, PlanError, RunOptions, Todo,
 };
 use coflash_core::update::many::ManyOptions;
 use coflash_core::update::{DeviceState, Event, FlashOptions};
 use coflash_core::Error;
 
-use super::packed;
+use super::{entry, packed};
 use crate::tap::Tap;
 use kit::fake::{Bus, Fake, Maker, APPLICATION, BOOTLOADER};
 
@@ -115,6 +118,89 @@ fn each_node_is_matched_and_a_foreign_one_is_left_alone() {
     for (node, is_written) in [(0, true), (1, false), (2, true), (3, true), (4, false)] {
         assert_eq!(!bus.0[node].blocks.is_empty(), is_written, "{node}");
         assert_eq!(bus.0[node].running, Some(APPLICATION));
+    }
+}
+
+/// What a device reports of its program beside its CRC: identity, 2005h and 1F52h.
+struct Told(Plate, u32, [u32; 2]);
+
+impl Maker for Told {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        match at {
+            (0x2005, 1) => Some(Ok(self.1.to_le_bytes().to_vec())),
+            (0x1F52, sub @ 1..=2) => Some(Ok(self.2[usize::from(sub) - 1].to_le_bytes().to_vec())),
+            _ => self.0.value(at, running),
+        }
+    }
+}
+
+/// A program of this version (major number) and date for node 5, with its CRC-32 in its last four bytes or without,
+/// for this product, 0 for any.
+fn dated(version: u32, date: u64, own_crc: bool, product: u32) -> Package {
+    let mut image = vec![7; 1000];
+    image[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x02, 0x08]);
+    if own_crc {
+        let crc = CRC32.checksum(&image);
+        image.extend(crc.to_le_bytes());
+    }
+    let label = Label::Release { vendor_id: 0, product_code: product, version, date };
+    let image = Firmware::Image(raw::read(&image, Some(0x0802_0000)).unwrap());
+    let blocks = program_of(image, &Options::default().label(label)).unwrap().program;
+    let bytes = block_file::emit(&blocks);
+    let entry = serde_json::from_str(&entry("drive", r#""nodes": [5]"#)).unwrap();
+    Package::parse(&make(None, None, &[Part { entry, bytes }], &[]).unwrap()).unwrap()
+}
+
+/// No value of a device is enough for "it has this program" where another one says something else. The dates are
+/// 2026-11-27 18:30:15 (15671 days after 1984-01-01, 66615 s) and none. 2144DF1Ch is the CRC of all data with their
+/// CRC-32 at the end.
+#[test]
+fn a_crc_alone_decides_nothing() {
+    const DATE: u64 = 1_795_804_215;
+    let crc = |package: &Package| package.programs().next().unwrap().1.crc();
+    let plain = crc(&dated(2, 0, false, 0));
+    let told = [15_671, 66_615_000];
+    for (own_crc, product, date, reported, (crc, version, told), todo) in [
+        (false, 0, 0, 1234, (plain, 2, [0; 2]), "has"),
+        (false, 0, 0, 1234, (plain, 0, [0; 2]), "has"),
+        (false, 1234, DATE, 1234, (plain, 2, told), "has"),
+        (false, 0, DATE, 1234, (plain, 2, [0; 2]), "has"),
+        (false, 0, DATE, 1234, (plain, 2, [15_671, 1]), "update"),
+        (false, 0, 0, 1234, (plain, 1, [0; 2]), "update"),
+        (false, 0, 0, 1234, (plain, 3, [0; 2]), "older"),
+        (false, 0, 0, 1234, (plain ^ 1, 3, [0; 2]), "older"),
+        (false, 0, 0, 1234, (plain ^ 1, 0x103, [0; 2]), "older"),
+        (false, 0, 0, 1234, (plain ^ 1, 2, [0; 2]), "update"),
+        (true, 0, 0, 1234, (0x2144_DF1C, 1, [0; 2]), "update"),
+        (true, 0, 0, 1234, (0x2144_DF1C, 0, [0; 2]), "update?"),
+        (true, 0, 0, 1234, (0x2144_DF1C, 2, [0; 2]), "update?"),
+        (true, 0, 0, 1234, (0x2144_DF1C, 3, [0; 2]), "older"),
+        // Block 0 names another machine, and a device without an identity takes any.
+        (false, 1235, 0, 1234, (plain, 2, [0; 2]), "leave"),
+        (false, 1235, 0, 0, (plain, 2, [0; 2]), "has"),
+    ] {
+        let package = dated(2, date, own_crc, product);
+        let vendor = if reported == 0 { 0 } else { 63 };
+        let mut fake = device(5, reported);
+        fake.maker = Some(Box::new(Told(Plate([vendor, reported, 2, 1005]), version, told)));
+        fake.crc_of_application = Some(crc);
+        let mut bus = Bus(vec![fake]);
+        let mut plan = planned(&mut bus, &package);
+        let step = &plan.devices[0].steps[0];
+        let doubt = if step.crc_tells_nothing { "?" } else { "" };
+        let row = format!("{own_crc} {product} {date} {crc:08X} {version} {told:?}");
+        assert_eq!(format!("{}{doubt}", step.todo.name()), todo, "{row}");
+        assert_eq!(plan.to_string().contains("each version of this program"), !doubt.is_empty(), "{row}");
+        assert_eq!(plan.is_of_other_machine(), todo == "leave", "{row}");
+        let is_written = |bus: &Bus| !bus.0[0].blocks.is_empty();
+        let outcomes = words(&carried_out(&mut bus, &package, &plan));
+        assert_eq!(is_written(&bus), todo.starts_with("update"), "{row}: {outcomes:?}");
+        if todo == "older" {
+            assert_eq!(outcomes, [(Some(5), 0, "6000040Fh".to_owned())], "{row}");
+            plan.allow_older(|node| node.get() == 5);
+            let outcomes = words(&carried_out(&mut bus, &package, &plan));
+            assert!(is_written(&bus) && outcomes[0].2 == "updated", "{row}: {outcomes:?}");
+        }
     }
 }
 

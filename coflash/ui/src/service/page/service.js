@@ -6,17 +6,18 @@ import { keep, keepField, kept } from "./kept.js";
 
 const FIELDS = ["operator", "order", "device-number"];
 const MARKS = {
-  "state-has": "✓", "state-due": "→", "state-left-out": "–", "state-waiting": "…", "state-working": "", "state-updated": "✓",
+  "state-has": "✓", "state-due": "→", "state-older": "!", "state-left-out": "–", "state-waiting": "…", "state-working": "", "state-updated": "✓",
   "state-failed": "✗",
 };
-const BANNER = { good: "✓", complete: "✓", bad: "✗", none: "✗", lost: "✗", searching: "", working: "", "planned-bad": "!", "good-unsaved": "!" };
+const BANNER = { good: "✓", complete: "✓", bad: "✗", none: "✗", "other-machine": "✗", lost: "✗", searching: "", working: "", "planned-bad": "!", "good-unsaved": "!" };
 
 let words = {};
 let language = kept("language") ?? (navigator.language.toLowerCase().startsWith("de") ? "de" : "en");
 /** What does not change while the station runs. */
 let station = null;
 let state = null;
-/** The devices of the plan that get their programs; all that need them, until the user leaves one out. */
+/** The devices of the plan that get their programs; all that need them, and none that would get an older one, until the
+ * user chooses. */
 let chosen = new Set();
 /** The number of the plan that was chosen from. */
 let plan = null;
@@ -46,15 +47,18 @@ function message(told, left) {
   ];
 }
 
+/** Whether a device can be chosen. */
+const isDue = (row) => row.state === "state-due" || row.state === "state-older";
+
 /** Enters the texts that are always on the page. */
 function translate() {
   document.documentElement.lang = language;
   for (const element of document.querySelectorAll("[data-t]")) text(element, t(element.dataset.t));
   for (const element of document.querySelectorAll("[data-t-label]")) element.ariaLabel = t(element.dataset.tLabel);
   for (const button of $("languages").children) button.ariaPressed = String(button.dataset.language === language);
-  const { name, release, file, signature } = station.package;
+  const { name, release, file, date, signature } = station.package;
   const named = [name, release].filter((part) => part !== null).join(" ");
-  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${signature === null ? "" : ` · ${t(signature)}`}`);
+  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${date === null ? "" : ` · ${t("of-date", { date })}`}${signature === null ? "" : ` · ${t(signature)}`}`);
   document.title = `${named || file} – coflash`;
   shown = "";
   if (state) show(state);
@@ -132,15 +136,15 @@ function unsaved() {
 
 function buttons() {
   const isPlanned = state.plan !== null;
-  const due = state.rows.filter((row) => row.state === "state-due").length;
+  const isReport = chosen.size === 0 && !state.rows.some((row) => row.state === "state-due");
   text($("search"), state.plans === 0 ? t("search") : t("search-again"));
   $("search").hidden = state.busy;
   $("search").disabled = !state.open;
   $("search").classList.toggle("main", !isPlanned || state.station === "none");
   $("update").hidden = !isPlanned || state.station === "none" || state.busy;
-  text($("update"), due === 0 ? t("save-report")
+  text($("update"), isReport ? t("save-report")
     : chosen.size === 0 ? t("update-none") : chosen.size === 1 ? t("update-one") : t("update-many", { count: chosen.size }));
-  $("update").disabled = !state.open || (due > 0 && chosen.size === 0);
+  $("update").disabled = !state.open || (!isReport && chosen.size === 0);
   $("stop").hidden = !state.busy;
   $("stop").disabled = state.cancelling;
   text($("stop"), state.cancelling ? t("stopping") : t("stop"));
@@ -168,7 +172,7 @@ function rows() {
 }
 
 function row(one) {
-  const isChoice = state.plan !== null && one.state === "state-due";
+  const isChoice = state.plan !== null && isDue(one);
   const head = one.node === null ? t("missing-device") : `${t("node")} ${one.node}`;
   const serial = one.identity[3];
   const box = isChoice
@@ -185,7 +189,8 @@ function row(one) {
   const step = (step) => el("li", {},
     el("span", {}, `${step.program}: `),
     el("span", { class: "version" }, step.from ?? t("no-program"), el("span", { class: "arrow" }, " → "), el("strong", {}, step.to)),
-    one.steps.length > 1 ? el("span", { class: "faint" }, ` · ${t(step.state)}`) : null);
+    one.steps.length > 1 ? el("span", { class: "faint" }, ` · ${t(step.state)}`) : null,
+    step.crc_tells_nothing ? el("span", { class: "faint" }, ` · ${t("crc-tells-nothing")}`) : null);
   return el("li", { class: "device", "data-state": one.state, "data-node": one.node },
     box,
     el("div", { class: "what" },
