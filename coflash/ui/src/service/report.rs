@@ -255,6 +255,7 @@ mod tests {
             from: None,
             to: "1.2".to_owned(),
             state: RowState::Updated,
+            crc_tells_nothing: false,
         };
         Row {
             node: Some(node),

@@ -36,14 +36,14 @@ fn config(server: &Server, bus: &str, folder: &Folder, ids: &[&str]) -> Config {
     Config::parse(&text, path.parent().unwrap_or(Path::new("")), Some(&server.url), None).unwrap()
 }
 
-fn options() -> Options {
+pub fn options() -> Options {
     let ms = Duration::from_millis;
     Options::default()
         .once(true)
         .times(Times::default().backoff_first(ms(50)).backoff_most(ms(200)).progress(ms(1)))
 }
 
-fn serve(config: &Config, options: &Options) -> (Ended, String) {
+pub fn serve(config: &Config, options: &Options) -> (Ended, String) {
     let said = Mutex::new(String::new());
     let show = |message: &Message| {
         *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);

@@ -122,10 +122,10 @@ impl Running {
 
     /// Waits for a line that contains this text.
     #[track_caller]
-    pub fn await_text(&self, text: &str) {
+    pub fn await_text(&self, text: &str) -> String {
         while let Some(line) = self.line() {
             if line.contains(text) {
-                return;
+                return line;
             }
         }
         panic!("it never says {text:?}, but: {}", self.said.borrow());

@@ -11,6 +11,7 @@ mod cuts;
 mod hosted;
 mod machine;
 mod nodes;
+mod outcomes;
 mod pages;
 mod production_line;
 mod service;
