@@ -275,3 +275,42 @@ def test_the_package_is_typed():
     assert os.path.exists(os.path.join(folder, "py.typed"))
     assert os.path.exists(os.path.join(folder, "_native.pyi"))
     assert coflash.__version__.count(".") == 2
+
+
+@pytest.mark.parametrize("dies", [False, True])
+def test_what_is_said_is_in_the_flash(tmp_path, dies):
+    """Two versions with their own CRC-32 at the end have one CRC; a device may lose its power in the second one."""
+
+    def version(number: int) -> bytes:
+        data = program()[:-4].replace(b"\xa5", bytes([number]))
+        return data + crc32(data).to_bytes(4, "little")
+
+    def held() -> bytes:
+        return (tmp_path / "1.flash").read_bytes()[0x2_0000:][: len(program())]
+
+    speed = "typical" if dies else "instant"
+    with Nodes(tmp_path, "--node", "77", "--serial", "77") as bus:
+        device = [os.environ["COBOOT_NODE"], "--bus", bus.bus, "--node", "5", "--flash", speed, "--stand-in"]
+        process = subprocess.Popen(device, cwd=tmp_path)
+        try:
+            for number in 1, 2:
+                path = tmp_path / f"{number}.bin"
+                path.write_bytes(version(number))
+                events = []
+
+                def note(event):
+                    events.append(event)
+                    if dies and number == 2 and event["event"] == "progress" and event["done"] > 4096:
+                        process.kill()
+
+                if dies and number == 2:
+                    with pytest.raises(coflash.Error):
+                        coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE)
+                    assert events[-1]["state"] == "erased"
+                    assert held() not in (version(1), version(2))
+                else:
+                    coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE)
+                    assert held() == version(number)
+        finally:
+            process.kill()
+            process.wait()

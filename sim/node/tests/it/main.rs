@@ -11,6 +11,7 @@ mod cuts;
 mod hosted;
 mod machine;
 mod nodes;
+#[cfg(unix)]
 mod outcomes;
 mod pages;
 mod production_line;

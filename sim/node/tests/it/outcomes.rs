@@ -4,6 +4,7 @@
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::panic::catch_unwind;
+use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Mutex;
 use std::thread;
@@ -50,7 +51,7 @@ enum Fate {
 /// The outcomes: what the devices have before, what they get, what happens, and what is to be said by `flash` and by
 /// a way with a plan.
 ///
-/// A file is its byte, its version (0 for none) and a letter: `p`lain, or with its CRC-32 at the end as `z`lib gives
+/// A file is its byte, its version (0 for a raw file, `n` for none in block 0) and a letter: `p`lain, or with its CRC-32 at the end as `z`lib gives
 /// it, `d` as the suffix of DFU has it; `i` has it at the end of its first part alone, and the rest is the same in each;
 /// `x` is for another product.
 const OUTCOMES: [(&str, &str, Fate, &str, &str); 16] = [
@@ -68,7 +69,7 @@ const OUTCOMES: [(&str, &str, Fate, &str, &str); 16] = [
     ("", "1-0p", Fate::Dies, "erased", "erased"),
     ("1-0p", "2-0p", Fate::Dies, "erased", "erased"),
     ("1-0p", "2-0p", Fate::Absent, "untouched", "untouched"),
-    ("1-0i", "2-0i", Fate::CutBefore, "updated", "updated"),
+    ("1-ni", "2-ni", Fate::CutBefore, "updated", "updated"),
     ("1-0p", "2-0p", Fate::CutBefore, "updated", "updated"),
 ];
 
@@ -97,9 +98,9 @@ fn file(folder: &Folder, coflash: &Coflash, name: &str) -> String {
     let product = if name.ends_with('x') { "99" } else { "3" };
     let (raw, blocks) = (format!("{name}.bin"), format!("{name}.blk"));
     let label = ["--vid", "0x3F", "--pid", product, "--ver", version];
-    coflash.done(
-        &[&["convert", &raw, &blocks, "-I", "binary", "--board", "stm32f407g-disc1"][..], &label].concat(),
-    );
+    let label = if version == "n" { &label[..4] } else { &label[..] };
+    let convert = ["convert", &raw, &blocks, "-I", "binary", "--board", "stm32f407g-disc1"];
+    coflash.done(&[&convert[..], label].concat());
     blocks
 }
 
@@ -167,8 +168,13 @@ impl Bench {
             let flash = [&["flash", &file, "-N", nodes, "--watch", "0"][..], raw(&file)].concat();
             if fate == Fate::CutBefore {
                 let running = bench.coflash.spawn(&flash);
-                bench.folder.await_bytes("1.flash", (AT + 2 * OWN) as u64);
-                drop(running);
+                bench.folder.await_bytes("1.flash", (AT + OWN) as u64);
+                assert!(Command::new("kill")
+                    .args(["-INT", &running.id().to_string()])
+                    .status()
+                    .unwrap()
+                    .success());
+                running.wait();
             } else {
                 bench.coflash.done(&flash);
             }
