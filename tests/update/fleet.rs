@@ -17,7 +17,7 @@ use coflash_core::device::Doing;
 use coflash_core::file::Program;
 use coflash_core::update::event::{Note, Warning};
 use coflash_core::update::many::ManyOptions;
-use coflash_core::update::Event;
+use coflash_core::update::{DeviceState, Event};
 use coflash_core::Error;
 use emulator::bus::fault::FaultAction;
 use emulator::frame::Frame;
@@ -159,6 +159,8 @@ fn a_device_that_stays_away_costs_the_others_nothing() {
     assert_eq!(update.done(), 2);
     let failed = update.results[0].as_ref().unwrap_err();
     assert!(matches!(failed.error, Error::NoAnswer { .. }), "{:?}", failed.error);
+    // That of the group, and not that of the attempt after it.
+    assert_eq!(failed.left.state, DeviceState::Erased, "{}", failed.left);
     fleet.bench.world.power_on(board);
     fleet.bench.run_ms(100);
     // Its half program is not started, and the next update goes on with it.

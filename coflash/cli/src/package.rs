@@ -469,6 +469,7 @@ fn summary(
             value["serial_number"] = json!(device.identity[3]);
             value["from"] = json!(step.and_then(|step| step.from.as_ref()));
             value["to"] = json!(step.map(|step| &step.to));
+            value["crc_tells_nothing"] = json!(step.is_some_and(|step| step.crc_tells_nothing));
         }
         match result {
             Ok(Good::Had) => {

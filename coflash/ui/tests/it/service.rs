@@ -22,6 +22,8 @@ use super::{Ui, HEX};
 struct Plate {
     product: u32,
     serial: Arc<Mutex<u32>>,
+    /// 2005h, 0 for none.
+    version: u32,
 }
 
 impl Maker for Plate {
@@ -31,6 +33,7 @@ impl Maker for Plate {
             (0x1018, 2) => self.product,
             (0x1018, 3) => 2,
             (0x1018, 4) => *self.serial.lock().unwrap(),
+            (0x2005, 1) if self.version != 0 => self.version,
             _ => return None,
         };
         Some(Ok(value.to_le_bytes().to_vec()))
@@ -41,7 +44,7 @@ impl Maker for Plate {
 fn device(node: u8, product: u32) -> (Fake, Arc<Mutex<u32>>) {
     let mut fake = Fake::new(APPLICATION).at(node, 1);
     let serial = Arc::new(Mutex::new(1000 + u32::from(node)));
-    fake.maker = Some(Box::new(Plate { product, serial: serial.clone() }));
+    fake.maker = Some(Box::new(Plate { product, serial: serial.clone(), version: 0 }));
     fake.crc_of_application = Some(0x1234_5678);
     fake.erase_time = Duration::from_millis(30);
     (fake, serial)
@@ -224,6 +227,37 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     fs::write(folder.join("bus"), format!("{next}\n")).unwrap();
     let ui = station(&folder, self::package(&folder, DRIVES), None);
     assert_eq!(ui.until("the adapter", |state| state["open"] == true)["adapter"], json!(next));
+}
+
+/// The device has V1.10r101, and the file is V1.10r100 (expected.py): it is written if the user chooses it, and not
+/// before. Of another machine that is said once, without a word at its devices.
+#[test]
+fn an_older_program_is_a_choice_and_another_machine_is_said_once() {
+    for product in [1234, 1235] {
+        let folder = kit::folder!(&format!("service-older-{product}"));
+        fs::write(folder.join("a.blk"), include_bytes!("../../../core/tests/data/release-110.blk")).unwrap();
+        let recipe =
+            "[[program]]\nname = 'drive'\nimage = 'a.blk'\nnodes = [5]\nvendor = 63\nproduct = 1234\n";
+        let (mut fake, serial) = device(5, product);
+        fake.maker = Some(Box::new(Plate { product, serial, version: 0x0065_0A01 }));
+        let (bus, server) = kit::fake::serve(Bus(vec![fake]));
+        let ui = station(&folder, package(&folder, recipe), Some(bus));
+        let plan = planned(&ui);
+        if product == 1235 {
+            assert_eq!((&plan["station"], rows(&plan)), (&json!("other-machine"), vec![(5, "state-failed")]));
+            assert_eq!(plan["rows"][0]["trouble"], Value::Null);
+            assert_eq!(confirm(&ui, &plan, &[5]).status, 400);
+        } else {
+            assert_eq!((&plan["station"], rows(&plan)), (&json!("planned"), vec![(5, "state-older")]));
+            assert_eq!(confirm(&ui, &plan, &[]).status, 200);
+            assert_eq!(rows(&ended(&ui)), [(5, "state-left-out")]);
+            let plan = planned(&ui);
+            assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+            assert_eq!(rows(&ended(&ui)), [(5, "state-updated")]);
+        }
+        assert_eq!(ui.finish(), None);
+        assert_eq!(server.join().unwrap().0[0].blocks.is_empty(), product == 1235);
+    }
 }
 
 /// One device has its program, the other one is missing: nothing was updated or was to be.

@@ -225,6 +225,23 @@ fn a_program_that_was_kept_is_known_by_a_crc_16_too() {
     assert!(action.details("closed").contains("since before the agent was restarted"), "{action:?}");
 }
 
+/// The device is silent: the agent has not changed it, and cannot say so of one with which an earlier agent has begun.
+#[test]
+fn what_an_earlier_agent_has_begun_is_not_said_to_be_unchanged() {
+    let folder = Folder::new("agent-begun");
+    let (nodes, server) = (Nodes::start(&folder, machine::STRANGER), Server::start(&IDS));
+    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    for words in
+        ["it was not changed", "it does not answer; last known: an earlier attempt has begun with it"]
+    {
+        server.assign(IDS[0], Action::new(1, &file(0xA5)));
+        serve(&config, &options());
+        let details = server.action(IDS[0]).details("closed");
+        assert!(details.contains(words), "{details}");
+        leave_begun(&record(&folder), false);
+    }
+}
+
 /// Nobody tells the agent which CRC the device has: the device does, when it gets its blocks.
 #[test]
 fn a_product_with_crc_16_gets_files_of_any_kind() {

@@ -169,11 +169,8 @@ impl Bench {
             if fate == Fate::CutBefore {
                 let running = bench.coflash.spawn(&flash);
                 bench.folder.await_bytes("1.flash", (AT + OWN) as u64);
-                assert!(Command::new("kill")
-                    .args(["-INT", &running.id().to_string()])
-                    .status()
-                    .unwrap()
-                    .success());
+                let id = running.id().to_string();
+                assert!(Command::new("kill").args(["-INT", &id]).status().unwrap().success());
                 running.wait();
             } else {
                 bench.coflash.done(&flash);
@@ -307,15 +304,11 @@ impl Page {
     fn until(&self, wanted: impl Fn(&Value) -> bool) -> Value {
         let stream = BufReader::new(self.send("GET", "events", ""));
         let events = stream.lines().map_while(Result::ok);
-        let states = events.filter_map(|line| {
+        let mut states = events.filter_map(|line| {
             let event: Value = serde_json::from_str(line.strip_prefix("data: ")?).ok()?;
             Some(event["state"].clone()).filter(|state| !state.is_null())
         });
-        let mut last = Value::Null;
-        states
-            .inspect(|state| last = state.clone())
-            .find(wanted)
-            .unwrap_or_else(|| panic!("the events ended"))
+        states.find(wanted).expect("the events go on")
     }
 }
 

@@ -58,7 +58,8 @@ function translate() {
   for (const button of $("languages").children) button.ariaPressed = String(button.dataset.language === language);
   const { name, release, file, date, signature } = station.package;
   const named = [name, release].filter((part) => part !== null).join(" ");
-  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${date === null ? "" : ` · ${t("of-date", { date })}`}${signature === null ? "" : ` · ${t(signature)}`}`);
+  const dated = date === null ? "" : " · " + t("of-date", { date });
+  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${dated}${signature === null ? "" : ` · ${t(signature)}`}`);
   document.title = `${named || file} – coflash`;
   shown = "";
   if (state) show(state);
@@ -190,7 +191,7 @@ function row(one) {
     el("span", {}, `${step.program}: `),
     el("span", { class: "version" }, step.from ?? t("no-program"), el("span", { class: "arrow" }, " → "), el("strong", {}, step.to)),
     one.steps.length > 1 ? el("span", { class: "faint" }, ` · ${t(step.state)}`) : null,
-    step.crc_tells_nothing ? el("span", { class: "faint" }, ` · ${t("crc-tells-nothing")}`) : null);
+    step.crc_tells_nothing ? el("span", { class: "faint" }, " · " + t("crc-tells-nothing")) : null);
   return el("li", { class: "device", "data-state": one.state, "data-node": one.node },
     box,
     el("div", { class: "what" },
