@@ -80,7 +80,10 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
             _ if answers.control == Some(ProgramState::Running as u32)
                 && !answers.running.is_bootloader() =>
             {
-                update.known.state_before
+                match update.known.state_before {
+                    DeviceState::Called | DeviceState::Begun => DeviceState::Untouched,
+                    state => state,
+                }
             }
             // The old program may have the same CRC.
             reported @ Some(_) if update.known.postponed && reported == update.known.before => {
