@@ -75,11 +75,30 @@ pub(super) fn admit<'f>(
         }
         Payload::Bootloader(_) => vec![],
     };
-    let is_sealed_in_blocks =
-        matches!(file, Payload::Sealed(_)) && !file.is_bootloader() && options.blocks.is_some();
-    let mut admission = Admission { number, is_sealed_in_blocks, open };
+    let mut admission = Admission { number, is_sealed_in_blocks: is_sealed_in_blocks(file, options), open };
     admission.ask(session, dialect)?;
     Ok(admission)
+}
+
+/// Whether the content is a sealed image that is to be sent in blocks.
+fn is_sealed_in_blocks(file: &Payload, options: &FlashOptions) -> bool {
+    matches!(file, Payload::Sealed(_)) && !file.is_bootloader() && options.blocks.is_some()
+}
+
+/// Checks whether this dialect has the way in which the content is to be sent.
+///
+/// # Errors
+/// [`Error::NotInDialect`].
+pub(super) fn judge_way(file: &Payload, dialect: Dialect, options: &FlashOptions) -> Result<(), Error> {
+    way(is_sealed_in_blocks(file, options), dialect)
+}
+
+fn way(is_sealed_in_blocks: bool, dialect: Dialect) -> Result<(), Error> {
+    let what = "a sealed image is sent in one download, not in blocks";
+    match is_sealed_in_blocks && dialect != Dialect::Block {
+        true => Err(Error::NotInDialect { dialect, what }),
+        false => Ok(()),
+    }
 }
 
 impl Admission<'_> {
@@ -91,10 +110,7 @@ impl Admission<'_> {
     /// [`Error::NotInDialect`], [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`],
     /// [`Error::SealedOnly`], and the errors of a [read](Session::read).
     pub(super) fn ask(&mut self, session: &mut Session<'_>, dialect: Dialect) -> Result<(), Error> {
-        if self.is_sealed_in_blocks && dialect != Dialect::Block {
-            let what = "a sealed image is sent in one download, not in blocks";
-            return Err(Error::NotInDialect { dialect, what });
-        }
+        way(self.is_sealed_in_blocks, dialect)?;
         let mut has_all = true;
         for question in &self.open {
             has_all &= question.is_answered(session, dialect, self.number)?;

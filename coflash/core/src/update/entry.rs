@@ -31,6 +31,7 @@ pub(super) fn enter(
     update.dialect = procedure(file, found.dialect).enter(session, found, update)?;
     let is_ready = (|| {
         if !found.running.is_bootloader() {
+            dialect::of(update.dialect).judge_password(session.node(), update.options.unlock)?;
             admission.ask(session, update.dialect)?;
         }
         match update.called {

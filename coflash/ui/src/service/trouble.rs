@@ -1,6 +1,6 @@
 //! Which message an error has: what a person at the machine can do about it.
 
-use canopen::AbortCode;
+use coflash_core::device::error::TrialFailure;
 use coflash_core::device::{Doing, Error};
 use coflash_core::machine::{Bad, DeviceFault, Missing, Outcome};
 use coflash_core::update::DeviceState;
@@ -24,11 +24,12 @@ pub(super) fn of_error(error: &Error) -> Message {
         | Error::OtherIdentity { .. }
         | Error::NotInDialect { .. } => "trouble-other-device",
         Error::NotAlone { .. } | Error::Occupied { .. } => "trouble-not-alone",
-        Error::NoBootloader { code: Some(AbortCode::DEVICE_STATE | AbortCode::LOCAL_CONTROL), .. } => {
-            "trouble-refuses-now"
+        error if error.refuses_now() => "trouble-refuses-now",
+        // Its program runs.
+        Error::NoBootloader { .. } | Error::TrialFailed { how: TrialFailure::Stays(_), .. } => {
+            "trouble-stays"
         }
-        Error::NoBootloader { .. }
-        | Error::TrialFailed { .. }
+        Error::TrialFailed { .. }
         | Error::StartFailed { .. }
         | Error::ProgramEnded { .. }
         | Error::FellSilent { .. } => "trouble-no-start",

@@ -56,6 +56,18 @@ impl Error {
     }
 }
 
+impl Error {
+    /// Whether an application that runs as it should refuses the call to the bootloader in its present state:
+    /// its machine moves, or is in use.
+    #[must_use]
+    pub fn refuses_now(&self) -> bool {
+        match *self {
+            Self::NoBootloader { code: Some(code), .. } => is_of_state(code),
+            _ => false,
+        }
+    }
+}
+
 fn trial_advice(node: NodeId, how: TrialFailure) -> Advice {
     match how {
         TrialFailure::NotStarted(_, state) => not_started_advice(state),

@@ -25,6 +25,10 @@ const ERROR_BITS: u32 = 0x81;
 pub(super) struct EsAcademy;
 
 impl Procedure for EsAcademy {
+    fn judge_password(&self, _: NodeId, password: Option<Password>) -> Result<(), Error> {
+        number(password).map(|_| ())
+    }
+
     /// The password of a program erases it.
     fn prepare(
         &self,
@@ -64,13 +68,7 @@ impl Procedure for EsAcademy {
         number: u8,
     ) -> Result<bool, Error> {
         let node = session.node();
-        let password = match password {
-            None => PASSWORD,
-            Some(password) => password.number().ok_or(Error::NotInDialect {
-                dialect: Dialect::EsAcademy,
-                what: "the password is a number of 32 bits: 0x and up to 8 digits, or 4 characters",
-            })?,
-        };
+        let password = self::number(password)?;
         let at = Address::new(program::ENABLE_FLASH, number);
         // The device erases before it answers.
         let mut patient = session.with(node, session.timing().erasing());
@@ -90,4 +88,15 @@ impl Procedure for EsAcademy {
         reset_program(session, number)?;
         await_program(session, number, began)
     }
+}
+
+/// The password as it is written into 7F50h.
+///
+/// # Errors
+/// [`Error::NotInDialect`] for a text of another form.
+fn number(password: Option<Password>) -> Result<u32, Error> {
+    password.map_or(Some(PASSWORD), |password| password.number()).ok_or(Error::NotInDialect {
+        dialect: Dialect::EsAcademy,
+        what: "the password is a number of 32 bits: 0x and up to 8 digits, or 4 characters",
+    })
 }

@@ -33,6 +33,10 @@ const HEARTBEAT: Duration = Duration::from_millis(1200);
 pub(super) struct Lift;
 
 impl Procedure for Lift {
+    fn judge_password(&self, node: NodeId, password: Option<Password>) -> Result<(), Error> {
+        password.map(|_| ()).ok_or(Error::NoPassword { node })
+    }
+
     fn enter(
         &self,
         session: &mut Session<'_>,
@@ -191,22 +195,16 @@ pub fn read_locked(
     password: Option<Password>,
     on_event: &mut dyn FnMut(Event),
 ) -> Result<Vec<u8>, Error> {
-    let running = session.find()?;
-    let dialect = match dialect {
-        Some(dialect) => dialect,
-        None => recognise(session, running, LIFT_PROGRAM)?,
-    };
-    let what = match dialect {
-        Dialect::Lift => None,
-        _ if dialect.has_password() => {
-            Some("the password erases the program, so there is nothing left to read")
-        }
-        _ => Some("no password allows reading"),
-    };
-    if let Some(what) = what {
-        return Err(Error::NotInDialect { dialect, what });
-    }
     let original = session.node();
+    // A dialect that is named is judged before the first frame.
+    if let Some(dialect) = dialect {
+        reads_locked(dialect)?;
+        Lift.judge_password(original, password)?;
+    }
+    let running = session.find()?;
+    if dialect.is_none() {
+        reads_locked(recognise(session, running, LIFT_PROGRAM)?)?;
+    }
     check(session, running, password)?;
     unlock_bootloader(
         session,
@@ -220,4 +218,17 @@ pub fn read_locked(
         restarted?;
     }
     bytes
+}
+
+/// Whether a password allows reading in this dialect.
+///
+/// # Errors
+/// [`Error::NotInDialect`].
+fn reads_locked(dialect: Dialect) -> Result<(), Error> {
+    let what = match dialect {
+        Dialect::Lift => return Ok(()),
+        _ if dialect.has_password() => "the password erases the program, so there is nothing left to read",
+        _ => "no password allows reading",
+    };
+    Err(Error::NotInDialect { dialect, what })
 }

@@ -18,6 +18,15 @@ use crate::update::steps;
 
 /// The parts of an update that each dialect and the renewal of a bootloader implement, in their order.
 pub(in crate::update) trait Procedure {
+    /// Checks the password before the first frame to a device, as far as the dialect alone decides.
+    ///
+    /// # Errors
+    /// [`Error::NoPassword`], and [`Error::NotInDialect`] for a password of another form.
+    fn judge_password(&self, node: NodeId, password: Option<Password>) -> Result<(), Error> {
+        let _ = (node, password);
+        Ok(())
+    }
+
     /// Step 3: makes the bootloader run, by the call of coboot and SYS TEC. Returns the dialect of the
     /// bootloader, which may report more than the application did.
     ///

@@ -4,7 +4,7 @@
 use super::update;
 use canopen::NodeId;
 use coflash_core::device::info::info;
-use coflash_core::device::{Dialect, Error, Session, Timing};
+use coflash_core::device::{Dialect, Doing, Error, Session, Timing};
 use coflash_core::file::convert::{program_of, Label as Told, Options};
 use coflash_core::file::{raw, Firmware, Program};
 use coflash_core::update::{DeviceState, Event, FlashOptions, Password, Report};
@@ -54,7 +54,7 @@ fn refused(fake: &mut Fake, file: &Program, options: FlashOptions) -> Error {
 }
 
 fn speaks(dialect: Dialect) -> FlashOptions {
-    FlashOptions::default().dialect(Some(dialect)).unlock(Password::new("open sesame"))
+    FlashOptions::default().dialect(Some(dialect)).unlock(Password::new("0x494E4954"))
 }
 
 #[test]
@@ -368,12 +368,13 @@ fn an_image_without_addresses_is_judged_by_the_devices_place() {
 }
 
 /// All programs of a lift except its program 1 are any bytes (CiA 814-1 clause 6.4): they are not
-/// checked, and the update continues with the password.
+/// checked, and the update continues with the password, which this device does not know.
 #[test]
 fn a_lifts_data_are_not_judged() {
     for bytes in [vec![0; 64], labelled(VENDOR, PRODUCT + 1)] {
         let file = file(&bytes, 0, Told::None);
         let options = FlashOptions::default().dialect(Some(Dialect::Lift)).program(2);
-        assert!(matches!(refused(&mut Fake::new(APPLICATION), &file, options), Error::NoPassword { .. }));
+        let error = refused(&mut Fake::new(APPLICATION), &file, options.unlock(Password::new("open")));
+        assert!(matches!(error, Error::Refused { doing: Doing::Unlock, .. }), "{error}");
     }
 }

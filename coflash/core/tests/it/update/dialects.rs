@@ -217,8 +217,9 @@ impl EsAcademy {
 }
 
 impl Maker for EsAcademy {
-    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
         match at {
+            (0x1F57, _) if running == APPLICATION => None,
             (0x1001, 0) => Some(Ok(vec![if self.failed { 0x81 } else { 0 }])),
             (0x1F56 | 0x1F57, _) => Some(Err(NO_OBJECT)),
             _ => None,
@@ -241,6 +242,7 @@ impl Maker for EsAcademy {
                 Ok(if starts { Deed::Restart(64, APPLICATION) } else { Deed::Nothing })
             }
             ((0x1F51, 1), _) if data == [2] => Ok(Deed::Restart(64, APPLICATION)),
+            ((0x1F51, 1), _) if data == [0x80] => Ok(Deed::Restart(64, BOOT)),
             ((0x1F51, 1), _) => Err(RANGE),
             _ => Err(NO_OBJECT),
         })
@@ -281,10 +283,39 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
         assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
         assert_eq!(left(&events), DeviceState::Untouched);
     }
-    let (mut fake, _) = EsAcademy::fake(|_| {});
-    let (result, ..) = run_at(&mut fake, 64, &locked("no number"));
-    assert!(matches!(result, Err(Error::NotInDialect { .. })), "{result:?}");
-    assert!(fake.writes().is_empty());
+}
+
+/// Where the dialect is named, no frame is sent; where the bootloader alone says it, the application runs again.
+#[test]
+fn a_password_of_another_form_stops_no_application() {
+    for (running, dialect) in [
+        (BOOT, None),
+        (APPLICATION, None),
+        (BOOT, Some(Dialect::EsAcademy)),
+        (APPLICATION, Some(Dialect::EsAcademy)),
+    ] {
+        let (mut fake, _) = EsAcademy::fake(|_| {});
+        fake.running = Some(running);
+        let (result, ..) = run_at(&mut fake, 64, &locked("no number").dialect(dialect));
+        assert!(matches!(result, Err(Error::NotInDialect { .. })), "{result:?}");
+        assert_eq!(
+            (fake.running, fake.sent.is_empty()),
+            (Some(running), dialect.is_some()),
+            "{:?}",
+            fake.log
+        );
+        assert_eq!(fake.count("64: 7F50/1, 4 bytes"), 0);
+    }
+    // A lift without a password, and one whose dialect allows no reading.
+    let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
+    let lift = FlashOptions::default().dialect(Some(Dialect::Lift));
+    assert!(matches!(run_at(&mut fake, NODE, &lift).0, Err(Error::NoPassword { .. })));
+    let mut session = Session::new(&mut fake, node(NODE), Timing::default());
+    let at = canopen::Address::new(0x1F50, 1);
+    for (dialect, password) in [(Dialect::Lift, None), (Dialect::EsAcademy, Password::new("INIT"))] {
+        assert!(read_locked(&mut session, at, Some(dialect), password, &mut |_| {}).is_err());
+    }
+    assert!(fake.sent.is_empty(), "{:?}", fake.log);
 }
 
 // --- CiA 302-3
