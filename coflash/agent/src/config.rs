@@ -18,6 +18,8 @@ use coflash_core::file::sealed::PublicKey;
 pub struct Config {
     pub(super) server: Server,
     pub(super) tenant: String,
+    /// The URL of the proxy before the server.
+    pub(super) proxy: Option<String>,
     /// The certificates that the server's one must come from; `None` for the usual ones.
     pub(super) ca_file: Option<PathBuf>,
     /// The folder for what must survive a restart, and for downloads.
@@ -118,6 +120,7 @@ pub struct Fault(String);
 struct File {
     url: Option<String>,
     tenant: Option<String>,
+    proxy: Option<String>,
     ca_file: Option<PathBuf>,
     state: Option<PathBuf>,
     #[serde(default)]
@@ -211,7 +214,7 @@ impl Config {
         })?;
         file.bus = file.bus.or_else(|| bus.map(String::from));
         let url = url.or(file.url.as_deref()).ok_or("it has no url: add it, or give --hawkbit URL")?;
-        let server = Server::parse(url)?;
+        let server = Server::parse(url).map_err(|why| format!("url: {why}"))?;
         if server.is_open() && !file.plain_http {
             return Err(format!(
                 "'{url}' would send the tokens over the network as plain text: use https://, or set plain-http = true"
@@ -222,6 +225,9 @@ impl Config {
         }
         let tenant = file.tenant.unwrap_or_else(|| "DEFAULT".to_string());
         name("tenant", &tenant)?;
+        if let Some(proxy) = &file.proxy {
+            Server::parse(proxy).map_err(|why| format!("proxy: {why}"))?;
+        }
         let (least, most) = (file.poll_least.unwrap_or(10), file.poll_most.unwrap_or(3600));
         if least == 0 || least > most || most > POLL_MOST {
             return Err(format!("poll-least and poll-most must be 1 to {POLL_MOST} seconds, in this order"));
@@ -258,6 +264,7 @@ impl Config {
         Ok(Self {
             server,
             tenant,
+            proxy: file.proxy,
             ca_file: file.ca_file.map(|path| folder.join(path)),
             state: folder.join(file.state.unwrap_or_else(|| "agent-state".into())),
             poll: (Duration::from_secs(least), Duration::from_secs(most)),

@@ -67,10 +67,10 @@ pub(super) struct Wanted {
 pub(super) enum Piece {
     /// The whole file is there; size and SHA-256 are right.
     Whole,
-    /// More of it is there, and the server can go on where this ended.
-    More,
-    /// The transfer broke off; whether more of the file is there than before.
-    Cut { more: bool, why: String, retry_after: Option<Duration> },
+    /// The transfer has paused after this many bytes of the file; the server can go on there.
+    More { at: u64 },
+    /// The transfer broke off after this many bytes of the file.
+    Cut { at: u64, why: String, retry_after: Option<Duration> },
     /// The server sends something else than it has announced.
     Wrong(String),
 }
@@ -217,6 +217,9 @@ enum Work {
     Fetching {
         task: Task,
         at: Duration,
+        /// The most bytes of the file that were there: an attempt that begins anew has made no progress before.
+        highest: u64,
+        /// The attempts since then.
         failures: u32,
         wrong: u32,
     },
@@ -666,7 +669,7 @@ impl Controller {
                 let resumed = self.record.has_begun(&task.action);
                 let execution = if resumed { Execution::Resumed } else { Execution::Download };
                 self.feedback(&task.action, execution, &[format!("{name}, {size} bytes")]);
-                self.work = Work::Fetching { task, at: now, failures: 0, wrong: 0 };
+                self.work = Work::Fetching { task, at: now, highest: 0, failures: 0, wrong: 0 };
             }
         }
     }
@@ -727,8 +730,16 @@ impl Controller {
 
     /// What became of an attempt to fetch the file.
     pub(super) fn fetched(&mut self, now: Duration, piece: Piece) {
-        let Work::Fetching { task, at, failures, wrong } = &mut self.work else { return };
+        let Work::Fetching { task, at, highest, failures, wrong } = &mut self.work else { return };
         let name = task.wanted.name.clone();
+        let reached = match &piece {
+            Piece::More { at } | Piece::Cut { at, .. } => *at,
+            Piece::Whole | Piece::Wrong(_) => 0,
+        };
+        let is_further = reached > *highest;
+        if is_further {
+            (*highest, *failures) = (reached, 0);
+        }
         match piece {
             Piece::Whole => {
                 let task = task.clone();
@@ -736,10 +747,14 @@ impl Controller {
                 // The deployment may have been cancelled or closed meanwhile.
                 self.poll_early(now);
             }
-            Piece::More => *failures = 0,
-            Piece::Cut { more, why, retry_after } => {
-                *failures = if more { 1 } else { *failures + 1 };
+            Piece::More { .. } if is_further => {}
+            Piece::More { .. } | Piece::Cut { .. } => {
+                *failures += 1;
                 let failures = *failures;
+                let (why, retry_after) = match piece {
+                    Piece::Cut { why, retry_after, .. } => (why, retry_after),
+                    _ => ("the server begins it anew each time".to_string(), None),
+                };
                 if failures > FETCHES_MOST {
                     let action = task.action.clone();
                     let why = format!("{name} cannot be fetched: {why} ({failures} attempts)");
@@ -802,7 +817,8 @@ impl Controller {
                 self.said.push(Message { controller, kind, text, update: Some(update) });
             }
             News::Percent(percent) => {
-                let percent = percent.min(100);
+                // A repetition begins at 0 again.
+                let percent = percent.min(100).max(progress.percent);
                 progress.percent = percent;
                 let worth = percent >= progress.reported.saturating_add(WORTH);
                 progress.news |= worth && progress.count < TOLD_MOST;

@@ -40,7 +40,7 @@ pub(super) fn fetch(
         Ok(piece) => piece,
         Err(error) => {
             let why = format!("{}: {error}", path.display());
-            Piece::Cut { more: false, why, retry_after: None }
+            Piece::Cut { at: 0, why, retry_after: None }
         }
     }
 }
@@ -52,6 +52,10 @@ fn piece(
     path: &Path,
     pause: &Pause<'_>,
 ) -> io::Result<Piece> {
+    if path.is_symlink() {
+        // None of ours: what is behind it stays as it is.
+        fs::remove_file(path)?;
+    }
     let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
     let mut at = file.metadata()?.len();
     if at >= wanted.size {
@@ -62,10 +66,10 @@ fn piece(
         file.set_len(0)?;
         at = 0;
     }
-    let cut = |more, why, retry_after| Ok(Piece::Cut { more, why, retry_after });
+    let cut = |at, why, retry_after| Ok(Piece::Cut { at, why, retry_after });
     let mut opened = match client.open(&wanted.link, token, at) {
         Ok(opened) => opened,
-        Err(why) => return cut(false, why, None),
+        Err(why) => return cut(at, why, None),
     };
     let goes_on = match opened.status {
         206 if opened.header("content-range").and_then(first_byte) == Some(at) => true,
@@ -75,11 +79,11 @@ fn piece(
         }
         206 | 416 => {
             file.set_len(0)?;
-            return cut(false, "the server gives another part of the file than asked for".to_string(), None);
+            return cut(0, "the server gives another part of the file than asked for".to_string(), None);
         }
         status => {
             let why = format!("the server answers with status {status} in place of the file");
-            return cut(false, why, opened.retry_after());
+            return cut(at, why, opened.retry_after());
         }
     };
     if let Some(length) = opened.body.content_length().filter(|length| at + length != wanted.size) {
@@ -88,16 +92,17 @@ fn piece(
     }
     file.set_len(at)?;
     file.seek(SeekFrom::Start(at))?;
-    let (began, before) = (Instant::now(), at);
+    let began = Instant::now();
     let mut reader = opened.body.as_reader();
     let mut buffer = [0; 16 * 1024];
     loop {
         if (pause.now)() || goes_on && began.elapsed() >= pause.after {
-            return Ok(Piece::More);
+            return Ok(Piece::More { at });
         }
         if began.elapsed() >= pause.after * LONGEST {
+            // Each attempt would be like this one.
             return cut(
-                false,
+                0,
                 "the transfer takes too long, and the server cannot go on later".to_string(),
                 None,
             );
@@ -112,11 +117,11 @@ fn piece(
                 }
                 file.write_all(&buffer[..count])?;
             }
-            Err(error) => return cut(at > before, format!("the transfer broke off: {error}"), None),
+            Err(error) => return cut(at, format!("the transfer broke off: {error}"), None),
         }
     }
     if at < wanted.size {
-        return cut(at > before, format!("the transfer ended after {at} of {} bytes", wanted.size), None);
+        return cut(at, format!("the transfer ended after {at} of {} bytes", wanted.size), None);
     }
     file.sync_all()?;
     Ok(match is_right(&mut file, wanted)? {

@@ -10,7 +10,7 @@ use std::time::Duration;
 use serde_json::Value;
 use ureq::http::{HeaderMap, Response};
 use ureq::typestate::WithBody;
-use ureq::{Agent, Body, RequestBuilder};
+use ureq::{Agent, Body, Proxy, RequestBuilder};
 
 use super::config::Token;
 use super::controller::{Reply, Request};
@@ -45,10 +45,21 @@ pub(super) struct Opened {
 }
 
 impl Client {
+    /// A connection through this proxy, or without one: those of the environment are for what the user of the
+    /// computer looks at, and would see the token.
+    ///
     /// # Errors
-    /// In words, for a file with certificates that cannot be used.
-    pub(super) fn new(server: Server, ca_file: Option<&Path>, limits: Limits) -> Result<Self, String> {
+    /// In words, for a proxy or a file with certificates that cannot be used.
+    pub(super) fn new(
+        server: Server,
+        proxy: Option<&str>,
+        ca_file: Option<&Path>,
+        limits: Limits,
+    ) -> Result<Self, String> {
+        let proxy = proxy.filter(|_| !server.is_local()).map(Proxy::new).transpose();
+        let proxy = proxy.map_err(|error| format!("the proxy cannot be used: {error}"))?;
         let config = Agent::config_builder()
+            .proxy(proxy)
             .user_agent(concat!("coflash/", env!("CARGO_PKG_VERSION")))
             .http_status_as_error(false)
             .max_redirects(0)
@@ -186,9 +197,30 @@ fn words(error: ureq::Error) -> String {
             "the server's name is unknown: check the url and the network".to_string()
         }
         ureq::Error::ConnectionFailed => "there is no connection to the server".to_string(),
-        error => format!("the server cannot be reached: {error}"),
+        error => {
+            let error = error.to_string();
+            let advice = CERTIFICATES.iter().find(|(what, _)| error.contains(what));
+            let advice = advice.map_or(String::new(), |(_, advice)| format!(": {advice}"));
+            format!("the server cannot be reached: {error}{advice}")
+        }
     }
 }
+
+/// What to do about a certificate that is not taken, by the name that the library has for the reason.
+const CERTIFICATES: [(&str, &str); 4] = [
+    (
+        "CaUsedAsEndEntity",
+        "the server's certificate is one of an authority (CA:TRUE), as openssl req -x509 makes it, and no server may \
+         have such a one: make it anew with -addext basicConstraints=critical,CA:FALSE and name it in ca-file, or let \
+         an authority sign a certificate of the server",
+    ),
+    (
+        "UnknownIssuer",
+        "name the certificate of the authority that has signed the server's one in ca-file",
+    ),
+    ("NotValidForName", "url must have a name or an address that is in the server's certificate"),
+    ("Expired", "renew the server's certificate, or set the clock of this computer"),
+];
 
 /// Trust in the certificates of a PEM file alone.
 #[cfg(feature = "tls")]

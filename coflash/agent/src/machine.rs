@@ -11,7 +11,7 @@ use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{plan, run, Bad, DeviceFault, Good, Outcome, Package, PlanError, RunOptions};
-use coflash_core::update::{Event, Known, ManyOptions};
+use coflash_core::update::{DeviceState, Event, Known, ManyOptions};
 use coflash_core::Error;
 
 use super::config::Machine;
@@ -27,7 +27,7 @@ pub(super) struct Order<'o> {
 }
 
 /// Updates the devices of a bus that the package is for. An interrupted update goes on with another call:
-/// its plan leaves out what the devices have.
+/// its plan leaves out what the devices have, and what is known of them says that it is such a one.
 ///
 /// # Errors
 /// How it ended before any device was changed.
@@ -78,7 +78,7 @@ pub(super) fn update(
     };
     let many = ManyOptions::default().cancelled(cancelled.clone());
     let options = RunOptions::default().many(many).known(*known);
-    Ok(flashed(package, &run(&mut *adapter, package, &plan, &options, &report)))
+    Ok(flashed(package, *known, &run(&mut *adapter, package, &plan, &options, &report)))
 }
 
 /// Locks these nodes too among the programs of this computer.
@@ -110,7 +110,7 @@ fn unplanned(error: PlanError) -> Flashed {
 
 /// The end of an update for the server: how many programs are in their devices, what is wrong with each other
 /// device, and which devices have what.
-fn flashed(package: &Package, outcomes: &[Outcome]) -> Flashed {
+fn flashed(package: &Package, known: Known, outcomes: &[Outcome]) -> Flashed {
     if outcomes.is_empty() {
         let what = "no device on the bus is one that the package is for, and nothing was changed";
         let advice =
@@ -148,7 +148,10 @@ fn flashed(package: &Package, outcomes: &[Outcome]) -> Flashed {
         };
         let updated = which(|good| matches!(good, Good::Updated(_)));
         let had = which(|good| matches!(good, Good::Had));
-        for (what, nodes) in [("updated: node", updated), ("had it before: node", had)] {
+        // Before the attempts of this action, or since one of them.
+        let has_begun = known.state() == DeviceState::Begun;
+        let before = if has_begun { "had it before this attempt: node" } else { "had it before: node" };
+        for (what, nodes) in [("updated: node", updated), (before, had)] {
             if !nodes.is_empty() {
                 lines.push(format!("{name}: {what} {nodes}"));
             }

@@ -53,8 +53,8 @@ fn news_of(event: &Event) -> Vec<News> {
 
 /// Why the bus or the device cannot be used now, if that is all that is wrong: nothing was changed.
 pub(super) fn not_now(error: &Error) -> Option<String> {
-    matches!(error, Error::Adapter(_) | Error::NotAlone { .. })
-        .then(|| format!("{error}: {}", error.advice()))
+    let is_in_use = matches!(error, Error::Adapter(_) | Error::NotAlone { .. }) || error.refuses_now();
+    is_in_use.then(|| format!("{error}: {}", error.advice()))
 }
 
 /// The same of an update that has failed.

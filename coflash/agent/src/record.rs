@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use tempfile::NamedTempFile;
 
 use super::ddi::is_id;
 use coflash_core::file::sealed::show::digits;
@@ -82,6 +83,13 @@ impl Store {
         Ok(Self { folder: folder.to_path_buf() })
     }
 
+    /// Checks that a file can be written: what must survive a restart is in files alone.
+    pub(super) fn check(&self) -> io::Result<()> {
+        let mut file = NamedTempFile::new_in(&self.folder)?;
+        file.write_all(&[0; 4096])?;
+        file.as_file().sync_all()
+    }
+
     /// The path of a device's file with this extension. The name is readable, and is no other
     /// device's even if the system does not distinguish small letters and capitals.
     pub(super) fn path(&self, controller: &str, extension: &str) -> PathBuf {
@@ -128,13 +136,11 @@ impl Store {
     }
 
     fn replace(&self, controller: &str, record: &Record) -> io::Result<()> {
-        let (path, new) = (self.path(controller, "json"), self.path(controller, "new"));
         let text = serde_json::to_vec_pretty(record).map_err(io::Error::other)?;
-        let mut file = File::create(&new)?;
+        let mut file = NamedTempFile::new_in(&self.folder)?;
         file.write_all(&text)?;
-        file.sync_all()?;
-        drop(file);
-        fs::rename(&new, &path)?;
+        file.as_file().sync_all()?;
+        file.persist(self.path(controller, "json"))?;
         // On Windows a folder cannot be opened as a file; its file system writes names in order.
         #[cfg(unix)]
         File::open(&self.folder)?.sync_all()?;
@@ -164,8 +170,14 @@ mod tests {
         let long = super::super::ddi::lines(&vec!["x".repeat(1000); 1000]);
         (40..80).for_each(|action| record.end(Finish { details: long.clone(), ..finish(action) }));
         store.save("door", &record).unwrap();
-        // A new file that was not finished when the power went does not count.
-        fs::write(store.path("door", "new"), "{").unwrap();
+        // A new file that was not finished when the power went does not count, and a link that somebody has put
+        // where the next one would be is not followed.
+        let precious = folder.join("precious");
+        fs::write(&precious, "{").unwrap();
+        #[cfg(unix)]
+        std::os::unix::fs::symlink(&precious, store.path("door", "new")).unwrap();
+        store.save("door", &record).unwrap();
+        assert_eq!(fs::read_to_string(&precious).unwrap(), "{");
         assert_eq!(store.load("door", "here").unwrap(), record);
         assert_eq!(store.load("Door", "here").unwrap(), Record::new("here"));
         assert_eq!(store.load("door", "another server").unwrap(), Record::new("another server"));
@@ -176,8 +188,8 @@ mod tests {
         assert!(store.load("door", "here").unwrap_err().contains("impossible id"));
         fs::write(store.path("door", "json"), "[".repeat((1 << 20) + 1)).unwrap();
         assert!(store.load("door", "here").unwrap_err().contains("more than 1048576 bytes"));
-        fs::remove_file(store.path("door", "new")).unwrap();
-        fs::create_dir(store.path("door", "new")).unwrap();
+        fs::remove_file(store.path("door", "json")).unwrap();
+        fs::create_dir(store.path("door", "json")).unwrap();
         let why = store.save("door", &record).unwrap_err();
         assert!(why.contains(&store.path("door", "json").display().to_string()), "{why}");
         assert!(!store.path("../../etc/passwd", "json").display().to_string().contains(".."));

@@ -137,10 +137,12 @@ pub fn run(
     let unusable = |error: &dyn std::fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
     let store = Store::new(folder).map_err(|error| unusable(&error))?;
     let _lock = lock(folder.join("agent.lock")).map_err(|why| unusable(&why))?;
+    // A lock of before can be taken in a folder that has become read-only or full.
+    store.check().map_err(|error| unusable(&format!("no file can be written into it: {error}")))?;
     let Times { silent, request, .. } = options.times;
     let limits = Limits { silent, request };
-    let client =
-        Client::new(config.server.clone(), config.ca_file.as_deref(), limits).map_err(CannotStart)?;
+    let (proxy, ca_file) = (config.proxy.as_deref(), config.ca_file.as_deref());
+    let client = Client::new(config.server.clone(), proxy, ca_file, limits).map_err(CannotStart)?;
     let shared = Shared { config, options, devices, report, client, limits, store, began: Instant::now() };
     let shared = &shared;
     let results: Vec<Ended> = thread::scope(|scope| {
@@ -159,7 +161,8 @@ pub fn run(
 
 /// Locks the folder, so that no second agent works with it.
 fn lock(path: PathBuf) -> Result<File, String> {
-    let file = File::create(path).map_err(|error| error.to_string())?;
+    let file = File::options().write(true).create(true).truncate(false).open(path);
+    let file = file.map_err(|error| error.to_string())?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {

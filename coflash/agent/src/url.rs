@@ -24,9 +24,10 @@ impl Server {
     /// # Errors
     /// In words, if it is no such URL.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
-        let wrong = |what: &str| format!("'{text}' is no URL of a server: {what}");
-        let (url, origin) =
-            requested(text).ok_or_else(|| wrong("it must be like https://hawkbit.example.com"))?;
+        // It may have a password, which goes into no message.
+        let wrong = |what: &str| format!("this is no URL of a server: {what}");
+        let (url, origin) = requested(text)
+            .ok_or_else(|| wrong("it must be like https://hawkbit.example.com, without a user name"))?;
         if url.has_query() || url.has_fragment() {
             return Err(wrong("it must end with the path"));
         }
@@ -43,6 +44,11 @@ impl Server {
     /// Whether a token would go over a network as plain text.
     pub(super) fn is_open(&self) -> bool {
         self.plain && !self.local
+    }
+
+    /// Whether it is on this computer.
+    pub(super) fn is_local(&self) -> bool {
+        self.local
     }
 
     /// Whether it is reached over TLS.

@@ -375,7 +375,7 @@ fn a_download_that_breaks_off_goes_on_and_one_that_never_begins_ends() {
     let mut drive = Drive::new();
     drive.deploy(&deployment("8", "forced"));
     drive.feedback();
-    let cut = |more, retry_after| Piece::Cut { more, why: "cut".into(), retry_after };
+    let cut = |at, retry_after| Piece::Cut { at, why: "cut".into(), retry_after };
     let next = |drive: &mut Drive| loop {
         match drive.next() {
             Step::Fetch(_) => return true,
@@ -387,19 +387,21 @@ fn a_download_that_breaks_off_goes_on_and_one_that_never_begins_ends() {
             _ => return false,
         }
     };
-    for _ in 0..100 {
+    for at in 1..100 {
         assert!(next(&mut drive));
-        drive.controller.fetched(drive.now, cut(true, None));
+        drive.controller.fetched(drive.now, cut(at, None));
     }
     assert!(next(&mut drive));
     let before = drive.now;
-    drive.controller.fetched(drive.now, cut(true, Some(seconds(600))));
+    drive.controller.fetched(drive.now, cut(100, Some(seconds(600))));
     assert!(next(&mut drive));
     assert!(drive.now - before >= seconds(600), "Retry-After counts");
     let mut attempts = 0;
     while next(&mut drive) {
         attempts += 1;
-        drive.controller.fetched(drive.now, cut(false, None));
+        // A server that knows no parts begins anew each time: what it sends again is no progress.
+        let piece = if attempts % 2 == 0 { cut(attempts, None) } else { Piece::More { at: 99 } };
+        drive.controller.fetched(drive.now, piece);
         assert!(attempts < 50);
     }
     assert!(drive.says("cannot be fetched"));
@@ -524,6 +526,8 @@ fn progress_is_told_sparingly_and_the_device_waits_for_no_message() {
     let mut messages = Vec::new();
     for percent in 0..=100 {
         drive.controller.news(News::Percent(percent));
+        // A repetition begins at 0 again, and what was reached counts.
+        drive.controller.news(News::Percent(0));
         // The device needs a quarter of a second for each percent.
         let until = drive.now + Duration::from_millis(250);
         loop {
@@ -735,8 +739,9 @@ fn no_course_of_answers_brings_it_out_of_step() {
                     drive.answer(statuses[pick(statuses.len())], &bodies[pick(bodies.len())]);
                 }
                 Step::Fetch(_) => {
-                    let cut = Piece::Cut { more: pick(2) == 0, why: String::new(), retry_after: None };
-                    let piece = [Piece::Whole, Piece::Whole, cut, Piece::Wrong(String::new()), Piece::More];
+                    let cut = Piece::Cut { at: pick(2) as u64, why: String::new(), retry_after: None };
+                    let more = Piece::More { at: pick(9) as u64 };
+                    let piece = [Piece::Whole, Piece::Whole, cut, Piece::Wrong(String::new()), more];
                     drive.controller.fetched(drive.now, piece[pick(5)].clone());
                 }
                 Step::Save(record) => {

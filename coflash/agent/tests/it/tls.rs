@@ -16,9 +16,9 @@ fn pem(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tls").join(name)
 }
 
-/// TLS in front of a server; returns its URL.
-fn before(server: &Server) -> String {
-    let chain = vec![CertificateDer::from_pem_file(pem("server.pem")).unwrap()];
+/// TLS with this certificate in front of a server; returns its URL.
+fn before(server: &Server, certificate: &str) -> String {
+    let chain = vec![CertificateDer::from_pem_file(pem(certificate)).unwrap()];
     let key = PrivateKeyDer::from_pem_file(pem("server.key")).unwrap();
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
@@ -84,7 +84,7 @@ fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
 #[test]
 fn a_server_is_trusted_with_the_certificates_that_are_named() {
     let server = Server::start(&["door"]);
-    let url = before(&server);
+    let url = before(&server, "server.pem");
     server.assign("door", Action::new(1, &File::new("a.blk", data!("identity-110.blk"))));
     let (ended, said) = once(&url, Some("authority.pem"), "good");
     assert_eq!((ended.updated, ended.unserved), (1, 0), "{said}");
@@ -95,10 +95,10 @@ fn a_server_is_trusted_with_the_certificates_that_are_named() {
 fn a_server_with_another_certificate_gets_no_request() {
     for (ca_file, test) in [(None, "usual"), (Some("other.pem"), "other")] {
         let server = Server::start(&["door"]);
-        let url = before(&server);
+        let url = before(&server, "server.pem");
         let (ended, said) = once(&url, ca_file, test);
         assert_eq!((ended.updated, ended.unserved), (0, 1), "{said}");
-        assert!(said.contains("certificate"), "{said}");
+        assert!(said.contains("UnknownIssuer: name the certificate of the authority"), "{said}");
         assert!(server.seen("/").is_empty());
         // Nor does a server whose name is another: the certificate is for 127.0.0.1.
         let (ended, said) = once(&url.replace("127.0.0.1", "localhost"), Some("authority.pem"), test);
@@ -107,12 +107,22 @@ fn a_server_with_another_certificate_gets_no_request() {
     }
 }
 
+/// RFC 5280 section 4.2.1.9, as the library reads it: the certificate of an authority is not one of a server.
+#[test]
+fn a_server_that_is_its_own_authority_gets_advice_and_no_request() {
+    let server = Server::start(&["door"]);
+    let (ended, said) = once(&before(&server, "own.pem"), Some("own.pem"), "own");
+    assert_eq!(ended.unserved, 1, "{said}");
+    assert!(said.contains("CA:TRUE") && said.contains("basicConstraints=critical,CA:FALSE"), "{said}");
+    assert!(server.seen("/").is_empty());
+}
+
 /// A file over http would be checked like any other; but who asks for it would be seen, and the
 /// server promised https.
 #[test]
 fn a_redirect_from_https_to_http_is_not_followed() {
     let (server, plain) = (Server::start(&["door"]), Server::start(&["cdn"]));
-    let url = before(&server);
+    let url = before(&server, "server.pem");
     let action = Action::new(1, &File::new("a.blk", data!("identity-110.blk")));
     plain.assign("cdn", action.clone());
     server.assign("door", action);

@@ -8,12 +8,16 @@ use crate::tool::folder;
 /// The controller-ID of the device.
 const ID: &str = "door";
 
+/// The variables for proxies. Nobody listens there: whoever asks a proxy of the environment reaches no server.
+const PROXIES: [&str; 3] = ["http_proxy", "https_proxy", "ALL_PROXY"];
+
 /// The command, as people run it: exit code, standard output and standard error.
 fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String) {
     let output = crate::tool::command()
         .args(arguments)
         .current_dir(folder)
         .env("TOKEN_OF_THE_DOOR", "t-door")
+        .envs(PROXIES.map(|name| (name, "http://127.0.0.1:9/")))
         .output()
         .unwrap();
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -55,4 +59,21 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     wrong(&["--hawkbit", &server.url], "it has no bus");
     wrong(&[&bus[..], &["--hawkbit", "http://hawkbit.example.com"]].concat(), "plain text");
     wrong(&[&bus[..], &["--hawkbit", &server.url, "--trace", "x.log"]].concat(), "--trace");
+
+    // The proxy of its own file: it hears of the server alone, and a server on this computer needs none.
+    let proxy = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let text = format!("proxy = 'http://{}'\nplain-http = true\n{door}", proxy.local_addr().unwrap());
+    std::fs::write(folder.join("agent.toml"), text).unwrap();
+    let (exit, out, err) = command(&folder, &common);
+    assert_eq!((exit, out.contains("0 updated, 0 failed, 0 not served")), (Some(0), true), "{out}{err}");
+    let asked = std::thread::spawn(move || {
+        let mut line = String::new();
+        let mut reader = std::io::BufReader::new(proxy.accept().unwrap().0);
+        std::io::BufRead::read_line(&mut reader, &mut line).map(|_| line).unwrap()
+    });
+    wrong(&[&bus[..], &["--hawkbit", "http://hawkbit.invalid"]].concat(), "");
+    assert_eq!(asked.join().unwrap(), "CONNECT hawkbit.invalid:80 HTTP/1.1\r\n");
+    let text = format!("proxy = 'http://me:PLANTED@127.0.0.1:9'\n{door}");
+    std::fs::write(folder.join("agent.toml"), text).unwrap();
+    wrong(&[&bus[..], &["--hawkbit", &server.url]].concat(), "proxy: ");
 }

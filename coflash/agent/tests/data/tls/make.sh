@@ -12,4 +12,6 @@ openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj /CN=server 
 printf 'subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n' >server.ext
 openssl x509 -req -in server.csr -CA authority.pem -CAkey authority.key -CAcreateserial -days 36500 \
     -extfile server.ext -out server.pem
+# What many tutorials make for a server: its own authority (CA:TRUE).
+openssl req -x509 -key server.key -days 36500 -subj /CN=server -addext subjectAltName=IP:127.0.0.1 -out own.pem
 rm -f authority.key other.key server.csr server.ext authority.srl
