@@ -2,14 +2,16 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use canopen::NodeId;
 use clap::Args;
 use coboot_can::Link;
 use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::Error;
 
 use super::output::{Exit, Failure};
+use super::record;
 use super::values::{attempts, milliseconds, node_id, number, program_number};
 
 /// One device.
@@ -35,7 +37,7 @@ pub(super) struct Program {
 }
 
 impl Device {
-    /// A session that Ctrl-C ends.
+    /// A session that [a signal](cancelled) ends.
     pub(super) fn session<'a>(&self, link: &'a mut Link) -> Result<Session<'a>, Failure> {
         self.patience.session(link, self.node)
     }
@@ -84,7 +86,7 @@ const DELAY: Duration = Duration::from_secs(1);
 const REPEATS: u32 = 0x400;
 
 impl Patience {
-    /// A session that Ctrl-C ends.
+    /// A session that [a signal](cancelled) ends.
     pub(super) fn session<'a>(&self, link: &'a mut Link, node: NodeId) -> Result<Session<'a>, Failure> {
         let mut session = Session::on(link, node, self.timing());
         session.cancel_by(cancelled()?);
@@ -116,8 +118,16 @@ impl Patience {
     }
 }
 
-/// The flag that Ctrl-C sets. The first Ctrl-C ends a transfer in an orderly way, the second one
-/// ends the program at once.
+/// Whether the user is asked something: nothing is under way that could be ended in order.
+static ASKED: AtomicBool = AtomicBool::new(false);
+
+/// Signals within this time are one: a terminal that is closed sends SIGHUP twice, by the system and by its shell.
+const ONE_SIGNAL: Duration = Duration::from_secs(1);
+
+/// The flag that Ctrl-C sets, and likewise SIGTERM (the stop of a service) and SIGHUP (a terminal that is closed); on
+/// Windows Ctrl-Break. The first signal ends a transfer in an orderly way, a later one ends the program at once.
+///
+/// A console of Windows that is closed ends its programs without waiting for them.
 pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
     if let Some(flag) = FLAG.get() {
@@ -125,13 +135,30 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     }
     let flag = FLAG.get_or_init(Arc::default).clone();
     let cancelled = flag.clone();
+    let mut first: Option<Instant> = None;
     ctrlc::set_handler(move || {
-        if cancelled.swap(true, Ordering::Relaxed) {
-            std::process::exit(i32::from(Exit::Cancelled as u8));
+        let was_set = cancelled.swap(true, Ordering::Relaxed);
+        let is_later = first.is_some_and(|first| first.elapsed() >= ONE_SIGNAL);
+        if ASKED.load(Ordering::Relaxed) || was_set && is_later {
+            let code = Exit::Cancelled as u8;
+            let _ = record::end(code.into(), Some(Failure::from(Error::Cancelled).value()["error"].clone()));
+            std::process::exit(code.into());
+        }
+        if !was_set {
+            first = Some(Instant::now());
         }
     })
     .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
     Ok(flag)
+}
+
+/// Waits for what the user says. A signal meanwhile ends the program at once.
+pub(super) fn asked<T>(wait: impl FnOnce() -> T) -> Result<T, Failure> {
+    cancelled()?;
+    ASKED.store(true, Ordering::Relaxed);
+    let said = wait();
+    ASKED.store(false, Ordering::Relaxed);
+    Ok(said)
 }
 
 #[cfg(test)]

@@ -14,9 +14,9 @@ use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::machine::{RecipeDevice, Row};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload};
+use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload, Report};
 use seal::wire::BOOTLOADER;
-use serde_json::json;
+use serde_json::{json, Value};
 use shared_abi::block_file::ProgramVersion;
 
 use super::context::Context;
@@ -25,8 +25,9 @@ use super::device::{cancelled, Patience};
 use super::dialect::Access;
 use super::file::{bytes, warn, Source};
 use super::legacy::Legacy;
-use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
+use super::many::{begin, diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
+use super::output_file;
 use super::package::{is_package, read_recipe, Given, Machine, Typed};
 use super::progress::Progress;
 use super::values::{nodes, number, program_number, watch_time};
@@ -197,6 +198,7 @@ impl Flash {
         self.legacy.check(context)?;
         let package = self.image().filter(|file| is_package(file));
         self.typed.check(package.is_some(), &options())?;
+        self.report.as_deref().map_or(Ok(()), output_file::ready)?;
         if let Some(package) = package {
             return self.machine(context, package);
         }
@@ -448,7 +450,33 @@ impl Flash {
     }
 
     fn one(&self, context: &Context, link: &mut Link, device: &Assignment) -> Result<(), Failure> {
-        let node = self.node_of(link, device)?;
+        begin(&json!([device.begun()]), self.report.as_deref())?;
+        let mut node = device.node;
+        let result = self.update(context, link, device, &mut node);
+        let name = node.map_or_else(|| device.name(), |node| format!("node {node}"));
+        let outcome = Outcome { node, name, image: device.image.display().to_string(), result };
+        if let Some(path) = &self.report {
+            write_report(path, &document(std::slice::from_ref(&outcome)))?;
+        }
+        let report = outcome.result?;
+        context.result(report, || {
+            let mut value = json!(report);
+            value["node"] = node.map(NodeId::get).into();
+            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
+            value
+        });
+        Ok(())
+    }
+
+    /// Updates a device. `at` is its node-ID as soon as it is known.
+    fn update(
+        &self,
+        context: &Context,
+        link: &mut Link,
+        device: &Assignment,
+        at: &mut Option<NodeId>,
+    ) -> Result<Report, Failure> {
+        let node = *at.insert(self.node_of(link, device)?);
         let _lock = self.lock(context, node)?;
         let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out, node);
@@ -461,22 +489,8 @@ impl Flash {
             event => progress.show(event),
         });
         progress.finish();
-        let waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
-        let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
-        drop(waiting);
-        let (name, image) = (format!("node {node}"), device.image.display().to_string());
-        let outcome = Outcome { node: Some(node), name, image, result };
-        if let Some(path) = &self.report {
-            write_report(path, &document(std::slice::from_ref(&outcome)))?;
-        }
-        let report = outcome.result?;
-        context.result(report, || {
-            let mut value = json!(report);
-            value["node"] = node.get().into();
-            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
-            value
-        });
-        Ok(())
+        let _waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
+        result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left))
     }
 
     fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
@@ -484,6 +498,7 @@ impl Flash {
             let advice = "leave out --together, or use an adapter on the bus";
             return Err(Failure::usage("a gateway does one transfer at a time", advice));
         }
+        begin(&devices.iter().map(Assignment::begun).collect(), self.report.as_deref())?;
         let mut outcomes: Vec<Option<Outcome>> = Vec::new();
         let mut jobs: Vec<(usize, Job)> = Vec::new();
         let mut locks = Vec::new();
@@ -552,6 +567,17 @@ fn brief(file: &SealedFile) -> String {
 }
 
 impl Assignment {
+    /// What a report says of it before it has an outcome.
+    fn begun(&self) -> Value {
+        json!({
+            "node": self.node.map(NodeId::get),
+            "name": self.name(),
+            "image": self.image.display().to_string(),
+            "ok": false,
+            "state": "begun",
+        })
+    }
+
     /// The device's name in messages.
     fn name(&self) -> String {
         match (self.node, self.address) {

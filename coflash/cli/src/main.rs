@@ -106,16 +106,20 @@ impl Command {
     }
 
     /// What the command writes into an object, if that may be a password.
-    fn password(&self) -> Option<&str> {
+    fn passwords(&self) -> Vec<&str> {
         match self {
-            Self::Write(write) => write.password(),
-            _ => None,
+            Self::Write(write) => write.passwords(),
+            _ => Vec::new(),
         }
     }
 
     fn run(&self, context: &Context) -> Result<(), Failure> {
         if let Some(bus) = context.bus.as_deref().filter(|_| self.takes_a_bus()) {
             coboot_can::check(bus)?;
+        }
+        if self.takes_a_bus() {
+            // Before the adapter is opened: each command ends in order.
+            device::cancelled()?;
         }
         match self {
             Self::Flash(flash) => flash.run(context),
@@ -163,8 +167,8 @@ fn main() -> ExitCode {
     let (out, log) = (context.out, context.log_file.as_deref());
     let begin = || {
         let (log, reports) = (context.log_file.as_deref(), context.report_dir.as_deref());
-        record::begin(log, reports, &context.command, &words(), command.password(), context.bus.as_deref())
-            .map_err(Failure::system)
+        let line = secrets::without(&words(), &command.passwords());
+        record::begin(log, reports, &context.command, &line, context.bus.as_deref()).map_err(Failure::system)
     };
     let spared = [log, context.trace.as_deref()].into_iter().flatten().try_for_each(output_file::spare);
     let result = spared.and_then(|()| begin()).and_then(|()| command.run(context));
@@ -175,7 +179,7 @@ fn main() -> ExitCode {
         out.say(format_args!("report: {}", folder.display()));
     }
     let failure = result.as_ref().err();
-    let error = failure.map(|failure| failure.value()["error"].clone());
+    let error = failure.map(Failure::recorded);
     let kept = record::end(failure.map_or(0, |failure| out.code(failure)), error);
     let kept = kept.map_err(Failure::system);
     let result = result.and_then(|()| kept.inspect_err(|failure| out.failure(failure)));
@@ -250,6 +254,7 @@ fn shell_line(shell: &Context, words: Vec<String>) -> Result<(), Failure> {
         let advice = "start the shell with them: coflash more shell --log-file FILE";
         return Err(Failure::usage("--log-file and --report-dir apply only to the shell as a whole", advice));
     }
+    secrets::hide(&cli.command.passwords());
     cli.command.run(&cli.context.or(shell))
 }
 

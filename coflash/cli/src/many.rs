@@ -4,10 +4,11 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use canopen::NodeId;
+use coboot_can::wall;
 use coflash_core::device::diagnose::{diagnose, Diagnosis};
 use coflash_core::device::Session;
 use coflash_core::update::many::Failed;
-use coflash_core::update::{Event, Report};
+use coflash_core::update::{stamp, Event, Report};
 use coflash_core::Error;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget};
 use serde_json::{json, Value};
@@ -170,7 +171,17 @@ pub(super) fn document(outcomes: &[Outcome]) -> Value {
 
 /// Writes the JSON document to a file.
 pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure> {
-    output_file::write(path, format!("{document:#}\n").as_bytes())
+    output_file::spare(path)?;
+    let written = record::replace(path, &format!("{document:#}\n"));
+    written.map_err(|error| output_file::unwritable(path, &error))
+}
+
+/// Keeps what is begun, before the first frame, in the record and in the file for the results.
+pub(super) fn begin(devices: &Value, report: Option<&Path>) -> Result<(), Failure> {
+    record::begun(devices).map_err(Failure::system)?;
+    let document =
+        json!({ "command": "flash", "state": "begun", "began": stamp(wall()), "devices": devices });
+    report.map_or(Ok(()), |path| write_report(path, &document))
 }
 
 fn outcome_value(outcome: &Outcome) -> Value {

@@ -196,7 +196,8 @@ impl Output {
 
     /// Prints a failure, the last message of a command.
     pub(super) fn failure(self, failure: &Failure) {
-        record::note("error", failure.to_string().trim_end());
+        let words = failure.in_records.clone().unwrap_or_else(|| failure.to_string());
+        record::note("error", words.trim_end());
         if self.for_programs() {
             if !failure.is_shown {
                 self.document("error", &failure.value());
@@ -278,6 +279,8 @@ pub(super) struct Failure {
     advice: Option<String>,
     /// The device's own answers, in words.
     answers: Vec<String>,
+    /// What records have in place of `what` and the advice, where these may quote a secret.
+    in_records: Option<String>,
     /// Whether the document on standard output already contains the failure.
     is_shown: bool,
 }
@@ -354,7 +357,7 @@ impl Failure {
     fn new(exit: Exit, what: impl Into<String>) -> Self {
         let (legacy, what) = (exit.legacy(), what.into());
         let (number, left, advice, answers) = (None, None, None, Vec::new());
-        Self { exit, number, legacy, what, left, advice, answers, is_shown: false }
+        Self { exit, number, legacy, what, left, advice, answers, in_records: None, is_shown: false }
     }
 
     /// The same failure with the manual's number, which is its exit code for the manual's tools.
@@ -380,7 +383,10 @@ impl Failure {
         let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
         let number = (of_node && wrong_value).then_some(legacy::INVALID_NODE_ID);
         let legacy = number.unwrap_or(legacy::INVALID_PARAMETER);
-        Self { number, legacy, ..Self::bare_usage(error.render().to_string()) }
+        // The parser quotes what it does not understand: a key after a misspelled option is one of those words.
+        let kind = error.kind().as_str().unwrap_or("the parser refuses it");
+        let in_records = Some(format!("the line cannot be read: {kind}"));
+        Self { number, legacy, in_records, ..Self::bare_usage(error.render().to_string()) }
     }
 
     /// An error in a recipe.
@@ -500,6 +506,15 @@ impl Failure {
             | ConvertError::Adjust(_)
             | ConvertError::Blocks(_) => Self::new(Exit::Usage, error.to_string()).numbered(0x6000_0018),
         }
+    }
+
+    /// What a record has of it.
+    pub(super) fn recorded(&self) -> Value {
+        let mut error = self.value()["error"].take();
+        if let Some(words) = &self.in_records {
+            error["what"] = words.as_str().into();
+        }
+        error
     }
 
     /// The JSON value.

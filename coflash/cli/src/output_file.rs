@@ -16,6 +16,22 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     fs::write(path, bytes).map_err(|error| unwritable(path, &error))
 }
 
+/// Checks before the first frame that a file can be written at the end. What is in it stays.
+pub(super) fn ready(path: &Path) -> Result<(), Failure> {
+    spare(path)?;
+    let there = fs::metadata(path);
+    if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        // A pipe waits for its reader.
+        return Ok(());
+    }
+    let opened = fs::OpenOptions::new().append(true).create(true).open(path);
+    opened.map_err(|error| unwritable(path, &error))?;
+    if there.is_err() {
+        let _ = fs::remove_file(path);
+    }
+    Ok(())
+}
+
 /// Refuses to let an output take the place of a private key or a key-encryption key: nobody could make it again.
 pub(super) fn spare(path: &Path) -> Result<(), Failure> {
     if !is_secret_key(path) {
@@ -59,6 +75,7 @@ pub(super) fn exists(path: &Path) -> Failure {
     Failure::usage(what, "name another file; --force replaces it, and the old key is gone then")
 }
 
-fn unwritable(path: &Path, error: &io::Error) -> Failure {
+/// A file that cannot be written.
+pub(super) fn unwritable(path: &Path, error: &io::Error) -> Failure {
     Failure::system(format!("{}: cannot be written: {error}", path.display()))
 }

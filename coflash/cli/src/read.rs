@@ -75,6 +75,7 @@ impl Read {
             let advice = "read one object at a time with --output";
             return Err(Failure::usage("--output takes only one object", advice));
         }
+        self.output.as_deref().map_or(Ok(()), output_file::ready)?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let node = session.node().get();

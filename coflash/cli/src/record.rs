@@ -3,7 +3,7 @@
 //!
 //! One record serves the whole program, so that code with a message need not have access to it.
 
-use std::ffi::OsString;
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -15,6 +15,7 @@ use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
 use coboot_can::{wall, Adapter, Tap};
+use coflash_core::file::limit::read_text;
 use coflash_core::update::{stamp, Event, Histories};
 use serde_json::{json, Value};
 
@@ -75,13 +76,12 @@ fn cannot(path: &Path, error: &io::Error) -> String {
 }
 
 /// Starts the records that the command line asks for. `command` is the command's full name; the folder
-/// has it, too.
+/// has it, too. `line` is what was typed, without secrets.
 pub(super) fn begin(
     log: Option<&Path>,
     reports: Option<&Path>,
     command: &str,
-    words: &[OsString],
-    password: Option<&str>,
+    line: &[String],
     bus: Option<&str>,
 ) -> Result<(), String> {
     let mut logs: Vec<Sink> = log.map(Sink::new).transpose()?.into_iter().collect();
@@ -94,7 +94,7 @@ pub(super) fn begin(
                 "coflash": env!("COFLASH_VERSION"),
                 "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
                 "command": command,
-                "command_line": secrets::without(words, password),
+                "command_line": line,
                 "bus": bus,
                 "began": stamp(wall()),
                 "ended": null,
@@ -113,7 +113,6 @@ pub(super) fn begin(
     };
     if !logs.is_empty() {
         let record = RECORD.get_or_init(|| Record { logs, report });
-        let line = secrets::without(words, password);
         record.note("command", &line.join(" "));
     }
     Ok(())
@@ -194,6 +193,59 @@ pub(super) fn failed(update: &coflash_core::update::FailedUpdate, more: &[(&str,
     let _ = report.write(&[]);
 }
 
+/// Records what is begun, before the first frame: it is known of a run that is killed, or loses its power.
+pub(super) fn begun(devices: &Value) -> Result<(), String> {
+    let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) else { return Ok(()) };
+    report.write(&[("begun", devices.clone())])
+}
+
+/// The updates that were begun and did not end, each with its time: of the runs in the folder of the reports, and of
+/// `document`, the report that a run before this one has left. For each device the latest run counts.
+pub(super) fn unended(document: Option<&Path>) -> Vec<(String, Value)> {
+    let read = |path: &Path| serde_json::from_str::<Value>(&read_text(path).ok()?).ok();
+    let own = folder();
+    let folders = own.and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
+    let mut runs: Vec<PathBuf> = folders.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    runs.retain(|path| Some(path.as_path()) != own);
+    // Their names begin with their times.
+    runs.sort();
+    let of_runs = runs.iter().rev().filter_map(|run| read(&run.join(FILES[0])));
+    let document = document.and_then(read).filter(|document| document["state"] == "begun");
+    let mut seen = BTreeSet::new();
+    let mut unended = Vec::new();
+    for mut run in document.into_iter().chain(of_runs) {
+        let list = if run["state"] == "begun" { "devices" } else { "begun" };
+        let devices = run[list].take();
+        for device in devices.as_array().into_iter().flatten() {
+            let which = ["node", "serial_number", "program"].map(|part| device[part].to_string());
+            if seen.insert(which) && run["ended"].is_null() {
+                unended.push((run["began"].as_str().unwrap_or_default().to_string(), device.clone()));
+            }
+        }
+    }
+    unended
+}
+
+/// Replaces a file as a whole: what it had stays if there is no room for the new contents.
+pub(super) fn replace(path: &Path, text: &str) -> io::Result<()> {
+    if fs::symlink_metadata(path).is_ok_and(|there| !there.is_file()) {
+        return fs::write(path, text);
+    }
+    let mut builder = tempfile::Builder::new();
+    // As for any new file; the user's mask takes away what he wants.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut file = match builder.tempfile_in(folder) {
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => return fs::write(path, text),
+        file => file?,
+    };
+    file.write_all(text.as_bytes())?;
+    file.as_file().sync_all()?;
+    file.persist(path)?;
+    Ok(())
+}
+
 /// Records the result of a command, as JSON.
 pub(super) fn result(value: &Value) {
     if let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) {
@@ -226,6 +278,8 @@ pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send
 impl Record {
     fn note(&self, kind: &str, words: &str) {
         let time = stamp(wall());
+        // The bytes of a frame are the redactor's concern.
+        let words = &if kind == "frame" { words.to_string() } else { secrets::without_known(words) };
         for (number, line) in words.lines().enumerate() {
             let kind = if number == 0 { kind } else { "" };
             let line = format!("{time}  {kind:<7}  {line}");
@@ -256,7 +310,8 @@ impl Report {
             document[*name] = value.clone();
         }
         let path = self.folder.join(FILES[0]);
+        secrets::hide_known(&mut document);
         let text = secrets::without_urls(&format!("{:#}\n", *document));
-        fs::write(&path, text).map_err(|error| cannot(&path, &error))
+        replace(&path, &text).map_err(|error| cannot(&path, &error))
     }
 }

@@ -1,29 +1,80 @@
 //! Removes passwords from a command line, and tokens from URLs, for records that users pass on.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
-/// The options with a secret value.
-const SECRET: [&str; 3] = ["--unlock", "--key", "--of-value"];
+use coboot_can::redact::is_password;
+use serde_json::Value;
+
+use super::values::address;
+
+/// The options with a secret value. A command that switches the power may have the password of a relay.
+const SECRET: [&str; 4] = ["--unlock", "--key", "--of-value", "--power-command"];
+
+/// The shortest secret that is looked for in other texts: a shorter one is a part of many words.
+const SHORTEST: usize = 4;
+
+/// The secrets of the lines so far.
+static KNOWN: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 /// The replacement for a password.
 pub(super) const HIDDEN: &str = "***";
 
-/// The words with the secrets hidden: the values of `--unlock`, `--key` and `--of-value`, and the
-/// password that the command writes into an object, if it writes one.
-pub(super) fn without(words: &[OsString], password: Option<&str>) -> Vec<String> {
-    let mut hide = false;
+/// The words with the secrets hidden: the values of the options with one, and the passwords that the command
+/// writes into an object, if it writes one. They are [hidden](hide) from now on.
+pub(super) fn without(words: &[OsString], passwords: &[&str]) -> Vec<String> {
+    hide(passwords);
+    let mut is_secret = false;
     let shown = |word: &OsString| {
         let word = word.to_string_lossy().into_owned();
-        if std::mem::take(&mut hide) || password == Some(&word) {
+        if std::mem::take(&mut is_secret) || passwords.contains(&word.as_str()) {
+            hide(&[&word]);
             return HIDDEN.to_string();
         }
-        if let Some(option) = SECRET.iter().find(|option| word.starts_with(&format!("{option}="))) {
-            return format!("{option}={HIDDEN}");
+        match word.split_once('=') {
+            Some((option, value)) if SECRET.contains(&option) => {
+                hide(&[value]);
+                return format!("{option}={HIDDEN}");
+            }
+            _ => is_secret = SECRET.contains(&word.as_str()),
         }
-        hide = SECRET.contains(&word.as_str());
         word
     };
     words.iter().map(shown).collect()
+}
+
+/// Whether a line of the shell has a secret: it is not kept for the next start.
+pub(super) fn are_in(line: &[String]) -> bool {
+    let words: Vec<OsString> = line.iter().map(OsString::from).collect();
+    let objects = || line.iter().filter(|word| word.len() >= 4).filter_map(|word| address(word));
+    // An object with a name may be one for passwords.
+    let is_written = objects().any(is_password) || objects().next().is_none();
+    line.iter().any(|word| word == "write") && is_written || without(&words, &[]) != line
+}
+
+/// Hides these words in the messages of every record from now on. The name of a file is no secret.
+pub(super) fn hide(secrets: &[&str]) {
+    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    let secrets = secrets.iter().filter(|secret| secret.len() >= SHORTEST && !Path::new(secret).exists());
+    known.extend(secrets.map(|secret| (*secret).to_string()));
+}
+
+/// A message without the secrets of the lines.
+pub(super) fn without_known(message: &str) -> String {
+    let known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    known.iter().fold(message.to_string(), |message, secret| message.replace(secret, HIDDEN))
+}
+
+/// The same for all texts of a document.
+pub(super) fn hide_known(value: &mut Value) {
+    match value {
+        Value::String(text) => *text = without_known(text),
+        Value::Array(all) => all.iter_mut().for_each(hide_known),
+        Value::Object(all) => all.values_mut().for_each(hide_known),
+        Value::Null | Value::Bool(_) | Value::Number(_) => {}
+    }
 }
 
 /// The text with the secrets of its URLs hidden: user names and passwords, queries and fragments,
@@ -81,6 +132,8 @@ fn without_secrets(text: &str, is_web: bool) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -96,9 +149,28 @@ mod tests {
             ("coflash write 6005/1 Sesam --type string", "coflash write 6005/1 *** --type string"),
             ("coflash write 6005/1 --type string Sesam", "coflash write 6005/1 --type string ***"),
             ("coflash flash a --unlock", "coflash flash a --unlock"),
+            ("more conform --power-command=relay:pw", "more conform --power-command=***"),
         ] {
             let words: Vec<OsString> = words.split(' ').map(OsString::from).collect();
-            assert_eq!(without(&words, Some("Sesam")).join(" "), shown);
+            assert_eq!(without(&words, &["Sesam"]).join(" "), shown);
+        }
+    }
+
+    #[test]
+    fn a_secret_of_a_line_is_in_no_later_text() {
+        hide(&["Se\"sam", "abc", "Cargo.toml"]);
+        let mut document = json!({ "Se\"sam": ["no Se\"sam, abc", { "in": "Cargo.toml" }] });
+        hide_known(&mut document);
+        assert_eq!(document, json!({ "Se\"sam": ["no ***, abc", { "in": "Cargo.toml" }] }));
+        for (line, has) in [
+            ("flash a -N 5", false),
+            ("flash a --unlock=x", true),
+            ("write 1017 500", false),
+            ("-N 5 write 6005/1 abcd", true),
+            ("write Code abc -N 5", true),
+        ] {
+            let words: Vec<String> = line.split(' ').map(String::from).collect();
+            assert_eq!(are_in(&words), has, "{line}");
         }
     }
 

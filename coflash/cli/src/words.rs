@@ -100,7 +100,7 @@ pub fn path(matches: &ArgMatches) -> String {
 /// otherwise the commands of the group in which it was searched.
 pub fn with_paths(mut error: clap::Error, words: &[OsString], root: &Command) -> clap::Error {
     let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else { return error };
-    let words = secrets::without(words, None);
+    let words = secrets::without(words, &[]);
     // The value of an option may be the same word.
     let is_value = |at: usize| {
         let option = Name::of(&words[at - 1]);

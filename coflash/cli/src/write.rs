@@ -49,9 +49,14 @@ pub(super) struct Write {
 }
 
 impl Write {
-    /// The value, if it may be a password. What an object with a name is, only the sheet says.
-    pub(super) fn password(&self) -> Option<&str> {
-        address(&self.object).is_none_or(is_password).then_some(&self.value)
+    /// The words that may be a password. What an object with a name is, only the sheet says; without one, both
+    /// words may have been exchanged.
+    pub(super) fn passwords(&self) -> Vec<&str> {
+        match address(&self.object) {
+            Some(at) if !is_password(at) => Vec::new(),
+            None if !self.names.has_sheet() => vec![&self.value, &self.object],
+            _ => vec![&self.value],
+        }
     }
 
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {

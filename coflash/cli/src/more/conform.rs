@@ -89,6 +89,7 @@ impl Conform {
             return Ok(());
         }
         let image = self.image(context)?;
+        self.junit.as_deref().map_or(Ok(()), output_file::ready)?;
         let _lock = context.lock(context.bus.as_deref(), self.node)?;
         let mut adapter = context.open()?;
         let warnings = self.warnings(&mut *adapter);

@@ -120,6 +120,9 @@ struct Done {
 
 impl Debug {
     pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if let Command::Read(Read { output: Some(path), .. }) = &self.command {
+            output_file::ready(path)?;
+        }
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
         let node = session.node();

@@ -20,7 +20,7 @@ use crate::adapters;
 use crate::context::Context;
 use crate::device::Device;
 use crate::output::Failure;
-use crate::output_file::write;
+use crate::output_file::{ready, write};
 use crate::record::{self, FILES};
 use crate::secrets::without_urls;
 
@@ -78,6 +78,7 @@ impl Report {
 impl Bundle {
     fn run(&self, context: &Context) -> Result<(), Failure> {
         let runs = self.runs()?;
+        ready(&self.output)?;
         let taken = &runs[runs.len().saturating_sub(MOST_RUNS)..];
         let url = context.url(context.bus.as_deref());
         let adapters = json!({

@@ -4,13 +4,15 @@ use std::io::IsTerminal;
 use std::sync::atomic::Ordering;
 
 use clap::Args;
+use coflash_core::Error;
 use rustyline::error::ReadlineError;
 use rustyline::DefaultEditor;
 
 use crate::context::Context;
-use crate::device::cancelled;
+use crate::device::{asked, cancelled};
 use crate::memory;
 use crate::output::Failure;
+use crate::secrets;
 
 /// Reads commands from the keyboard or from standard input and runs them.
 ///
@@ -36,7 +38,9 @@ impl Shell {
             let _ = editor.load_history(history);
         }
         loop {
-            let line = match editor.readline(if interactive { "coflash> " } else { "" }) {
+            // A signal before this line has ended the line before.
+            cancelled()?.store(false, Ordering::Relaxed);
+            let line = match asked(|| editor.readline(if interactive { "coflash> " } else { "" }))? {
                 Ok(line) => line,
                 Err(ReadlineError::Interrupted) => continue,
                 Err(ReadlineError::Eof) => break,
@@ -49,11 +53,14 @@ impl Shell {
                 Some(word) if word.starts_with('#') => continue,
                 Some(_) => {}
             }
-            if interactive {
+            if interactive && !secrets::are_in(&words) {
                 let _ = editor.add_history_entry(&line);
             }
-            cancelled()?.store(false, Ordering::Relaxed);
             match (command(context, words), interactive) {
+                // What ends by a signal as it should, such as monitor, ends a script with it.
+                (Ok(()), false) if cancelled()?.load(Ordering::Relaxed) => {
+                    return Err(Error::Cancelled.into())
+                }
                 (Ok(()), _) => {}
                 (Err(failure), true) => context.out.failure(&failure),
                 (Err(failure), false) => return Err(failure),

@@ -9,7 +9,9 @@ use coflash_core::file::sealed::{Sealer, SigningKey};
 use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
 use crate::tool::{coflash, data, folder, Done};
+use kit::fake::{serve, Fake, APPLICATION};
 use kit::folder::Folder;
+use serde_json::{json, Value};
 
 fn recipe(text: &str, folder: &Path) -> Result<(Recipe, Vec<Part>), String> {
     let parsed = Recipe::parse(text, folder);
@@ -290,5 +292,51 @@ fn what_contradicts_a_package_is_refused() {
         (&["flash", "--job", before], 3, "line 2: [[device]] is of the job files of before"),
     ] {
         coflash(words).fails(exit, &[error]);
+    }
+}
+
+/// A run that was killed has left what it had begun, in its report or in the folder of the reports. The next run does
+/// not say that the device had its program before; one of another device does.
+#[test]
+fn a_device_that_an_interrupted_run_has_written_did_not_have_its_program() {
+    let folder = folder("package-resumed");
+    fs::copy(data("plain-400.blk"), folder.join("b.blk")).unwrap();
+    folder.file("line.toml", b"[[program]]\nimage = 'b.blk'\nnodes = [5]\n");
+    coflash(&["package", &folder.path("line.toml")]).good();
+    let package = Package::parse(&fs::read(folder.join("line.cpk")).unwrap()).unwrap();
+    let crc = package.programs().next().unwrap().1.crc();
+    let [report, reports] = ["report.json", "reports"].map(|name| folder.path(name));
+    let flash = |more: &[&str]| {
+        let mut fake = Fake::new(APPLICATION);
+        fake.crc_of_application = Some(crc);
+        let (url, _device) = serve(fake);
+        let words = ["--bus", &url, "flash", &folder.path("line.cpk"), "--yes", "--json"];
+        let done = coflash(&[&words[..], more].concat()).good();
+        serde_json::from_str::<Value>(&done.out).unwrap()["devices"][0].clone()
+    };
+    let had = flash(&["--report", &report]);
+    assert_eq!(had["state"], "had", "{had:#}");
+    let mut begun = had.clone();
+    begun["state"] = "begun".into();
+    let document = |serial: &Value| {
+        let mut device = begun.clone();
+        device["serial_number"] = serial.clone();
+        json!({ "state": "begun", "began": "2026-11-28T09:15:00.000Z", "devices": [device] }).to_string()
+    };
+    for (serial, state) in [(&had["serial_number"], "resumed"), (&json!(4711), "had")] {
+        fs::write(&report, document(serial)).unwrap();
+        assert_eq!(flash(&["--report", &report])["state"], state);
+        // A later run that has ended counts more than one before.
+        for (run, ended, state) in
+            [("20261128T091500-flash", json!(null), state), ("20261129T091500-flash", json!("x"), "had")]
+        {
+            let mut of_run: Value = serde_json::from_str(&document(serial)).unwrap();
+            of_run["begun"] = of_run["devices"].take();
+            (of_run["state"], of_run["ended"]) = (json!(null), ended);
+            fs::create_dir_all(format!("{reports}/{run}")).unwrap();
+            fs::write(format!("{reports}/{run}/report.json"), of_run.to_string()).unwrap();
+            assert_eq!(flash(&["--report-dir", &reports])["state"], state, "{run}");
+        }
+        fs::remove_dir_all(&reports).unwrap();
     }
 }

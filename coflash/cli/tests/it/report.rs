@@ -2,7 +2,11 @@
 
 use std::collections::HashSet;
 use std::fs;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
 use std::time::Duration;
 
 use crate::tool::{command, data, folder, run, Done};
@@ -165,6 +169,106 @@ fn a_password_that_write_sends_is_in_no_record() {
         assert!(!texts.iter().any(|text| text.contains("PLANTED")), "{words:?}: {texts:?}");
         fs::remove_dir_all(run).unwrap();
     }
+}
+
+/// What the parser does not understand may be a key after a misspelled option, or the value of the right one. Its words
+/// are on the terminal alone.
+#[test]
+fn an_error_of_a_line_of_the_shell_has_no_secret_in_the_records() {
+    let folder = folder("shell-secrets");
+    for line in [
+        "flash a.blk --unlok PLANTED-value",
+        "convert a.hex b.cbs --key PLANTED-value",
+        "PLANTED-value",
+        "writes 6005/1 PLANTED-value",
+        "write PLANTED-value 6005/1 --type string",
+        "more conform --answer-timeout PLANTED-value",
+    ] {
+        let bus = ["--bus", "socketcand://127.0.0.1:1/can0"];
+        let mut command = command();
+        command.current_dir(folder.path("")).args(["more", "shell", "--report-dir", "reports"]).args(bus);
+        let files = ["--log-file", "all.log"];
+        folder.write("line", format!("{line}\n").as_bytes());
+        let input = fs::File::open(folder.path("line")).unwrap();
+        let done = run(command.args(files).stdin(input));
+        assert!(done.exit == 2 && !done.err.is_empty(), "{line}: {}", done.err);
+        let run = runs(&folder).pop().unwrap();
+        run_in(&folder, &["more", "report", "bundle", "reports", "-o", "fault.zip"]).good();
+        let bundle = members(&folder.path("fault.zip")).into_iter();
+        let bundle = bundle.map(|(_, bytes)| String::from_utf8(bytes).unwrap());
+        let files = fs::read_dir(&run).unwrap().map(|file| file.unwrap().path());
+        let files =
+            files.chain([folder.path("all.log").into()]).map(|path| fs::read_to_string(path).unwrap());
+        let texts: Vec<String> = files.chain(bundle).collect();
+        assert!(!texts.iter().any(|text| text.contains("PLANTED")), "{line}: {texts:#?}");
+        assert!(texts.iter().filter(|text| text.contains("  error    ")).count() == 2, "{line}: {texts:#?}");
+        fs::remove_dir_all(run).unwrap();
+    }
+}
+
+/// A shell that waits for a line, and a service station in the middle of an update, when their service is stopped.
+#[cfg(unix)]
+#[test]
+fn what_is_stopped_leaves_its_reports() {
+    let folder = folder("stopped");
+    let start = |words: &[&str]| {
+        let mut command = command();
+        command.current_dir(folder.path("")).args(words).args(["--report-dir", "reports"]);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap()
+    };
+    let stop = |mut child: Child| {
+        // Its input stays open meanwhile.
+        let _input = child.stdin.take();
+        assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
+        child.wait().unwrap().code()
+    };
+    let mut shell = start(&["more", "shell", "--bus", "socketcand://127.0.0.1:1/can0"]);
+    shell.stdin.as_mut().unwrap().write_all(b"adapters --search none\n").unwrap();
+    let mut line = String::new();
+    BufReader::new(shell.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    assert_eq!(stop(shell), Some(130), "{line}");
+    let report = fs::read_to_string(runs(&folder)[0].join("report.json")).unwrap();
+    assert!(serde_json::from_str::<Value>(&report).unwrap()["ended"].is_string(), "{report}");
+    fs::remove_dir_all(&runs(&folder)[0]).unwrap();
+
+    let mut device = bootloader();
+    device.erase_time = Duration::from_secs(3600);
+    let (url, _device) = serve(device);
+    fs::copy(data("plain-400.blk"), folder.path("a.blk")).unwrap();
+    folder.write("job.toml", b"[[program]]\nimage = 'a.blk'\nnodes = [5]\n");
+    let mut station = start(&["ui", "--service", "job.toml", "--no-open", "--bus", &url, "--json"]);
+    let mut line = String::new();
+    BufReader::new(station.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    let page: Value = serde_json::from_str(&line).unwrap();
+    let page = page["url"].as_str().unwrap().strip_prefix("http://").unwrap();
+    let (host, path) = page.split_once('/').unwrap();
+    let post = |what: &str, body: &str| {
+        let mut stream = TcpStream::connect(host).unwrap();
+        let head =
+            format!("POST /{path}{what} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n");
+        let length = body.len();
+        write!(stream, "{head}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}").unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        answer.starts_with("HTTP/1.1 200")
+    };
+    let until = |what: &str, is_so: &dyn Fn() -> bool| {
+        let is_so_now = |_: &usize| {
+            thread::sleep(Duration::from_millis(10));
+            is_so()
+        };
+        assert!((0..2000).find(is_so_now).is_some(), "{what} never comes");
+    };
+    until("the search", &|| post("search", "{}"));
+    let order = r#"{"plan":1,"nodes":[5],"operator":"","order":"","device_number":"","language":"en"}"#;
+    until("the update", &|| post("update", order));
+    let of_device =
+        |ending: &str| runs(&folder).into_iter().find(|path| path.to_string_lossy().ends_with(ending));
+    until("its beginning", &|| of_device("_begun.csv").is_some());
+    assert_eq!(stop(station), Some(0));
+    assert!(of_device("_begun.csv").is_none());
+    let report = fs::read_to_string(of_device(".csv").unwrap()).unwrap();
+    assert!(report.contains(",failed,5,"), "{report}");
 }
 
 /// `monitor` begins while another tool sends a password in segments: what names its object has passed before.

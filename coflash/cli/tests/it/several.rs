@@ -301,10 +301,20 @@ impl coboot_can::Adapter for Chatter {
     }
 }
 
-/// Ctrl-C in the middle of the blocks.
+/// Ctrl-C, the stop of a service, and a terminal that is closed, in the middle of the blocks: the last one comes
+/// twice, by the system and by the shell. What is begun is in the reports before that.
 #[cfg(unix)]
 #[test]
 fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
+    let folder = folder("interrupted");
+    for signals in [&["-INT"][..], &["-TERM"], &["-HUP", "-HUP"]] {
+        an_interruption_ends_in_order(&folder.path(signals[0]), signals);
+    }
+}
+
+#[cfg(unix)]
+fn an_interruption_ends_in_order(folder: &str, signals: &[&str]) {
+    fs::create_dir(folder).unwrap();
     let mut slow = device(5, BOOTLOADER);
     // Each block takes some time, so that the signal comes in the middle.
     let (reported, heard) = std::sync::mpsc::channel();
@@ -316,21 +326,38 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     let (url, server) = serve(slow);
     let child = crate::tool::command()
         .args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")])
+        .args(["--report", "of-device.json", "--report-dir", "reports"])
+        .current_dir(folder)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
     while heard.recv().unwrap() != 1 {}
-    let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(interrupted.success());
+    let reports = || {
+        let run = fs::read_dir(format!("{folder}/reports")).unwrap().next().unwrap().unwrap().path();
+        let read = |path| serde_json::from_slice(&fs::read(path).unwrap()).unwrap();
+        let of_device: Value = read(format!("{folder}/of-device.json").into());
+        let of_run: Value = read(run.join("report.json"));
+        (of_device, of_run)
+    };
+    let (of_device, of_run) = reports();
+    assert_eq!((&of_device["state"], &of_device["devices"][0]["node"]), (&"begun".into(), &5.into()));
+    assert_eq!((&of_run["begun"], &of_run["ended"]), (&of_device["devices"], &Value::Null));
+    for signal in signals {
+        assert!(Command::new("kill").args([signal, &*child.id().to_string()]).status().unwrap().success());
+    }
     let done = child.wait_with_output().unwrap();
     let err = String::from_utf8(done.stderr).unwrap();
-    assert_eq!(done.status.code(), Some(130), "{err}");
+    assert_eq!(done.status.code(), Some(130), "{signals:?}: {err}");
     assert_eq!(
         err,
         "error: cancelled [0x60000011]\n  the device: its bootloader is running; it contains no complete program\n  \
          what to do: run the same command again to continue\n"
     );
+    let (of_device, of_run) = reports();
+    assert_eq!(of_device["devices"][0]["error"]["device"], "erased", "{of_device:#}");
+    assert_eq!((&of_run["exit"], &of_run["failed_updates"][0]["node"]), (&130.into(), &5.into()));
+    assert!(of_run["ended"].is_string(), "{of_run:#}");
     let mut fake = server.join().unwrap();
     assert!(
         fake.log.last().unwrap() == "abort 08000000" || fake.log.last().unwrap().starts_with("read"),

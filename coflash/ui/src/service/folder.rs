@@ -1,8 +1,10 @@
 //! The folder of the reports.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::{self, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
+
+use tempfile::{Builder, NamedTempFile};
 
 /// The most reports with one name: those of one device in one second.
 const SAME: u32 = 100;
@@ -36,22 +38,41 @@ impl Folder {
     /// # Errors
     /// The error of the system.
     pub(super) fn check(&self, reports: usize) -> io::Result<()> {
-        let mut made = Vec::new();
-        let written = self.fill(FILES * reports, &mut made);
-        let removed = made.iter().map(fs::remove_file).fold(Ok(()), io::Result::and);
-        written.and(removed)
+        self.fill(FILES * reports)?.into_iter().try_for_each(NamedTempFile::close)
     }
 
     /// Writes files of the size of a report's: a file system may have room in bytes, and for no more files.
-    fn fill(&self, files: usize, made: &mut Vec<PathBuf>) -> io::Result<()> {
-        for number in 0..files {
-            let path = self.0.join(format!(".coflash-{}-{number}", std::process::id()));
-            let mut file = File::create(&path)?;
-            made.push(path);
+    fn fill(&self, files: usize) -> io::Result<Vec<NamedTempFile>> {
+        let file = |_| {
+            let mut file = Builder::new().prefix(".coflash-").tempfile_in(&self.0)?;
             file.write_all(&[0; ROOM])?;
-            file.sync_all()?;
+            file.as_file().sync_all()?;
+            Ok(file)
+        };
+        (0..files).map(file).collect()
+    }
+
+    /// Removes the reports with this name.
+    pub(super) fn remove(&self, name: &str, endings: &[&str]) {
+        // What cannot be removed says of an update that it was begun, which is so.
+        endings.iter().for_each(|ending| drop(fs::remove_file(self.0.join(format!("{name}.{ending}")))));
+    }
+
+    /// The reports whose names have this part: their names and what is in them. They get another part in its
+    /// place.
+    pub(super) fn rename(&self, part: &str, other: &str) -> Vec<(String, String)> {
+        let entries = fs::read_dir(&self.0).into_iter().flatten().filter_map(Result::ok);
+        let mut renamed = Vec::new();
+        for name in entries.filter_map(|entry| entry.file_name().into_string().ok()) {
+            let path = self.0.join(&name);
+            let to = self.0.join(name.replace(part, other));
+            if name.contains(part) && !to.exists() && fs::rename(&path, &to).is_ok() {
+                let name = to.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+                renamed.push((name, fs::read_to_string(&to).unwrap_or_default()));
+            }
         }
-        Ok(())
+        renamed.sort();
+        renamed
     }
 
     /// Saves contents as files of one name, each with its ending, and returns the name. No file is replaced; if one
@@ -110,10 +131,11 @@ mod tests {
         assert_eq!(names, ["a.csv", "a.html", "a_2.csv", "a_2.html", "b.csv", "b_2.csv", "b_2.html"]);
         assert_eq!(fs::read_to_string(folder.path().join("b.csv")).unwrap(), "precious");
         // Two reports need room for four files.
-        let mut made = Vec::new();
-        folder.fill(FILES * 2, &mut made).unwrap();
-        assert!(made.len() == 4 && made.iter().all(|path| path.exists()), "{made:?}");
-        assert!(folder.check(2).is_ok() && made.iter().all(|path| !path.exists()), "{made:?}");
+        let made = folder.fill(FILES * 2).unwrap();
+        assert!(made.len() == 4 && made.iter().all(|file| file.path().exists()), "{made:?}");
+        drop(made);
+        assert!(folder.check(2).is_ok());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 7);
         // A file where the folder was.
         fs::remove_dir_all(folder.path()).unwrap();
         fs::write(place.join("new"), "").unwrap();

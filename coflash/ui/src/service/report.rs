@@ -8,6 +8,7 @@ use std::sync::Arc;
 use coflash_core::file::inspect::Date;
 use serde::Deserialize;
 
+use super::folder::Folder;
 use super::message::Message;
 use super::row::{Row, RowState, Step};
 use super::setup::Origin;
@@ -57,7 +58,13 @@ pub(super) struct Of {
 pub(super) struct Report {
     row: Row,
     of: Arc<Of>,
+    /// Whether the update has begun, and nothing more is known.
+    is_begun: bool,
 }
+
+/// The end of the name of a report about an update that has begun, and of one that did not end.
+const BEGUN: &str = "_begun";
+const INTERRUPTED: &str = "_interrupted";
 
 /// Why reports are not saved.
 pub(super) fn unsaved(error: &io::Error, folder: &Path) -> Message {
@@ -66,22 +73,50 @@ pub(super) fn unsaved(error: &io::Error, folder: &Path) -> Message {
     Message::new(key).value("folder", folder.display()).detail(error)
 }
 
+/// The part of a name that is a device's own.
+fn of_device(row: &Row) -> String {
+    let node = row.node.map_or(String::new(), |node| format!("_node-{node}"));
+    let serial = row.identity[3].map_or(String::new(), |serial| format!("_{serial:08X}h"));
+    node + &serial
+}
+
+/// Notes which devices have their program from an update that did not end: a report of its beginning is there, and
+/// gets the name of one that was interrupted.
+pub(super) fn note_interrupted(rows: &mut [Row], folder: &Folder) {
+    for row in rows.iter_mut().filter(|row| !matches!(row.state, RowState::LeftOut | RowState::Failed)) {
+        let device = of_device(row);
+        let earlier = folder.rename(&format!("{device}{BEGUN}"), &format!("{device}{INTERRUPTED}"));
+        let has = |text: &String| {
+            row.steps.iter().all(|step| [&step.program, &step.to].iter().all(|word| text.contains(*word)))
+        };
+        row.interrupted = earlier.into_iter().rfind(|(_, text)| has(text)).map(|(name, _)| name);
+    }
+}
+
 impl Report {
     pub(super) fn new(row: Row, of: Arc<Of>) -> Self {
-        Self { row, of }
+        Self { row, of, is_begun: false }
+    }
+
+    /// The report of an update before its first frame: what is left of one whose computer loses its power.
+    pub(super) fn begun(row: Row, of: Arc<Of>) -> Self {
+        Self { row, of, is_begun: true }
     }
 
     /// The name of its files: date, node-ID and serial number.
     pub(super) fn name(&self) -> String {
         let date = Date(self.of.date).to_string().replace(" UTC", "Z").replace(':', "").replace(' ', "_");
-        let node = self.row.node.map_or(String::new(), |node| format!("_node-{node}"));
-        let serial = self.row.identity[3].map_or(String::new(), |serial| format!("_{serial:08X}h"));
-        format!("{date}{node}{serial}")
+        let begun = if self.is_begun { BEGUN } else { "" };
+        format!("{date}{}{begun}", of_device(&self.row))
     }
+
+    /// The endings of its files.
+    pub(super) const ENDINGS: [&str; 2] = ["html", "csv"];
 
     /// The files, each with its ending.
     pub(super) fn contents(&self) -> [(&'static str, String); 2] {
-        [("html", self.html()), ("csv", self.csv())]
+        let [html, csv] = Self::ENDINGS;
+        [(html, self.html()), (csv, self.csv())]
     }
 
     /// Everything that must not be lost, in one line for the terminal.
@@ -92,10 +127,12 @@ impl Report {
 
     /// The cells of a line for each program; of a device that is missing, for the one that it should have.
     fn cells(&self) -> Vec<Vec<String>> {
-        let Self { row, of } = self;
+        let Self { row, of, is_begun } = self;
         let Of { date, entered, package, release, file, adapter, .. } = &**of;
         let word = |state: RowState| match state {
+            _ if *is_begun => "begun",
             RowState::Updated => "updated",
+            RowState::Has if row.interrupted.is_some() => "resumed",
             RowState::Has => "had",
             _ => "failed",
         };
@@ -144,13 +181,15 @@ impl Report {
 
     /// A page that needs no other file, in the language of the user.
     fn html(&self) -> String {
-        let Self { row, of } = self;
+        let Self { row, of, is_begun } = self;
         let Of { date, entered, origin, package, release, file, adapter, missing } = &**of;
         let language = entered.language;
         let text = |key: &'static str| escaped(language.text(key));
         let unknown = || language.text("report-unknown").to_owned();
-        let (mark, result) = match row.state {
+        let result = |state: RowState| match state {
+            _ if *is_begun => ("bad", "report-begun"),
             RowState::Updated => ("good", "report-good"),
+            RowState::Has if row.interrupted.is_some() => ("good", "report-resumed"),
             RowState::Has => ("good", "report-had"),
             _ => ("bad", "report-bad"),
         };
@@ -158,7 +197,7 @@ impl Report {
         let [vendor, product, revision, serial] = row.identity;
         let parts: Vec<String> = [vendor, product, revision].into_iter().map(hex).collect();
         let some = |text: &Option<String>| text.clone().unwrap_or_default();
-        let facts: [(&'static str, String); 12] = [
+        let facts: [(&'static str, String); 13] = [
             ("report-date", Date(*date).to_string()),
             ("operator", entered.operator.clone()),
             ("order", entered.order.clone()),
@@ -169,6 +208,7 @@ impl Report {
             ("identity", parts.join(" / ")),
             (origin.key(), [&*some(package), &*some(release), file].join(" ").trim().to_owned()),
             ("report-missing", missing.iter().map(|it| language.message(it)).collect::<Vec<_>>().join(" ")),
+            ("report-interrupted", some(&row.interrupted)),
             ("report-adapter", adapter.clone()),
             ("report-tool", format!("coflash {}", env!("CARGO_PKG_VERSION"))),
         ];
@@ -177,11 +217,12 @@ impl Report {
              <meta http-equiv=\"content-security-policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
              <title>{}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{}</h1>\n\
-             <p class=\"result {mark}\">{}</p>\n<table>\n",
+             <p class=\"result {}\">{}</p>\n<table>\n",
             language.code(),
             text("report-title"),
             text("report-title"),
-            text(result),
+            result(row.state).0,
+            text(result(row.state).1),
         );
         for (key, value) in facts.iter().filter(|(_, value)| !value.is_empty()) {
             let _ = writeln!(page, "<tr><th>{}</th><td>{}</td></tr>", text(key), escaped(value));
@@ -192,13 +233,8 @@ impl Report {
                 ["program", "from", "to", "report-result"].map(|key| format!("<th>{}</th>", text(key)));
             let _ = writeln!(page, "<table>\n<tr>{}</tr>", heads.concat());
             for step in &row.steps {
-                let result = match step.state {
-                    RowState::Updated => "report-good",
-                    RowState::Has => "report-had",
-                    _ => "report-bad",
-                };
                 let from = step.from.as_deref().unwrap_or_else(|| language.text("no-program"));
-                let cells = [&*step.program, from, &*step.to, language.text(result)];
+                let cells = [&*step.program, from, &*step.to, language.text(result(step.state).1)];
                 let cells = cells.map(|cell| format!("<td>{}</td>", escaped(cell)));
                 let _ = writeln!(page, "<tr>{}</tr>", cells.concat());
             }

@@ -18,6 +18,9 @@ pub(super) struct Row {
     pub(super) identity: [Option<u32>; 4],
     pub(super) state: RowState,
     pub(super) steps: Vec<Step>,
+    /// The report of an update that did not end, from which it has its program.
+    #[serde(skip)]
+    pub(super) interrupted: Option<String>,
     /// The program of a device that is missing.
     #[serde(skip)]
     pub(super) missing: Option<String>,

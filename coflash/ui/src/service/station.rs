@@ -54,6 +54,8 @@ pub(super) struct Station {
     state: Mutex<State>,
     /// The reports that are not saved yet; locked while they are written.
     unsaved: Mutex<Vec<Report>>,
+    /// The names of the reports about what has begun.
+    begun: Mutex<Vec<String>>,
 }
 
 impl Station {
@@ -62,7 +64,7 @@ impl Station {
         let is_locked = |(entry, _): (&Entry, _)| entry.dialect() == Some(Dialect::Lift);
         let asks_password = service.package.programs().any(is_locked);
         let state = State { asks_password, ..State::default() };
-        Self { service, state: Mutex::new(state), unsaved: Mutex::default() }
+        Self { service, state: Mutex::new(state), unsaved: Mutex::default(), begun: Mutex::default() }
     }
 
     /// Changes the state. The caller has all pages notified.
@@ -76,6 +78,23 @@ impl Station {
             Stage::Planned { number, plan } if *number == wanted => Some(plan.clone()),
             _ => None,
         }
+    }
+
+    /// Saves a report of each device that is about to be written. Returns why that is not possible.
+    pub(super) fn begin(&self, rows: &[Row], of: &Arc<Of>) -> Option<Message> {
+        let folder = &self.service.folder;
+        let mut begun = lock(&self.begun);
+        for row in rows.iter().filter(|row| row.state == RowState::Waiting) {
+            let report = Report::begun(row.clone(), of.clone());
+            match folder.save(&report.name(), &report.contents()) {
+                Ok(name) => begun.push(name),
+                Err(error) => {
+                    begun.drain(..).for_each(|name| folder.remove(&name, &Report::ENDINGS));
+                    return Some(report::unsaved(&error, folder.path()));
+                }
+            }
+        }
+        None
     }
 
     /// Keeps reports, and saves them.
@@ -101,6 +120,11 @@ impl Station {
             }
         });
         let left = unsaved.len();
+        if left == 0 {
+            // The outcomes take the place of what has begun.
+            let names = std::mem::take(&mut *lock(&self.begun));
+            names.iter().for_each(|name| self.service.folder.remove(name, &Report::ENDINGS));
+        }
         self.change(|state| {
             state.saved.extend(saved);
             (state.unsaved, state.why) = (left, why.clone());

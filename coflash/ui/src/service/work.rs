@@ -12,7 +12,7 @@ use coflash_core::update::{Event, FlashOptions, ManyOptions, Password};
 use coflash_core::Error;
 
 use super::message::Message;
-use super::report::{unsaved, Entered, Of};
+use super::report::{note_interrupted, unsaved, Entered, Of};
 use super::row::{note, rows, Row};
 use super::station::{change, reports, Stage, Station};
 use super::trouble;
@@ -144,14 +144,28 @@ impl Work for Update {
         if let Some(message) = station.save() {
             return refused(station, shared, back(), message);
         }
-        if let Err(error) = service.folder.check(rows.len()) {
+        if let Err(error) = service.folder.check(2 * rows.len()) {
             return refused(station, shared, back(), unsaved(&error, service.folder.path()));
         }
         let _locks = match locked(shared, self.nodes.iter().copied()) {
             Ok(locks) => locks,
             Err(message) => return refused(station, shared, back(), message),
         };
-        let date = wall().as_secs();
+        note_interrupted(&mut rows, &service.folder);
+        let manifest = service.package.manifest();
+        let of = Arc::new(Of {
+            date: wall().as_secs(),
+            entered: self.entered.clone(),
+            origin: service.origin,
+            package: manifest.name.clone(),
+            release: manifest.release.clone(),
+            file: service.file.clone(),
+            adapter: shared.read(|state| state.adapter.url.clone()),
+            missing: self.plan.missing.iter().map(trouble::of_missing).collect(),
+        });
+        if let Some(message) = station.begin(&rows, &of) {
+            return refused(station, shared, back(), message);
+        }
         let on_event = |node: NodeId, _: usize, event: Event| {
             shared.record(node, &event);
             shared.change(|state| {
@@ -167,18 +181,7 @@ impl Work for Update {
         if outcomes.iter().any(trouble::is_locked) {
             station.change(|own| own.asks_password = true);
         }
-        let manifest = service.package.manifest();
-        let of = Of {
-            date,
-            entered: self.entered.clone(),
-            origin: service.origin,
-            package: manifest.name.clone(),
-            release: manifest.release.clone(),
-            file: service.file.clone(),
-            adapter: shared.read(|state| state.adapter.url.clone()),
-            missing: self.plan.missing.iter().map(trouble::of_missing).collect(),
-        };
-        station.keep(reports(&rows, &Arc::new(of)));
+        station.keep(reports(&rows, &of));
         shared.change(|state| {
             for update in &mut state.updates {
                 let row = rows.iter().find(|row| row.node == Some(update.node));

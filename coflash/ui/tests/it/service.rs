@@ -407,10 +407,35 @@ fn the_end_of_the_server_saves_the_outcome() {
     let plan = planned(&ui);
     assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
     ui.until("the update", |state| state["rows"][0]["state"] == "state-working");
+    // What has begun is there already: a computer that loses its power leaves this.
+    let [(name, begun)] = &saved(&folder, "csv")[..] else { panic!("one report") };
+    assert!(name.ends_with("Z_node-5_000003EDh_begun.csv") && begun.contains(",begun,5,"), "{name}: {begun}");
     let words = ui.finish().expect("an update was running");
     assert!(words.starts_with("an update was running: node 5: cancelled"), "{words}");
     let reports = saved(&folder, "csv");
     assert!(reports.len() == 1 && reports[0].1.contains(",failed,5,"), "{reports:?}");
+
+    // As after a loss of power in the update of node 5, which had its program by then; node 6 is as before.
+    fs::remove_file(folder.join("reports").join(&reports[0].0)).unwrap();
+    fs::write(folder.join("reports").join(name), begun).unwrap();
+    let package = package(&folder, DRIVES);
+    let mut has = device(5, 1234).0;
+    has.crc_of_application = Some(package.programs().next().unwrap().1.crc());
+    let (bus, _server) = kit::fake::serve(Bus(vec![has, device(6, 1234).0]));
+    let ui = station(&folder, package, Some(bus));
+    let plan = planned(&ui);
+    assert_eq!(rows(&plan), [(5, "state-has"), (6, "state-due")]);
+    assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
+    ended(&ui);
+    let reports = saved(&folder, "csv");
+    let [(old, _), (_, five), (_, six)] = &reports[..] else { panic!("{reports:?}") };
+    assert!(old.ends_with("Z_node-5_000003EDh_interrupted.csv"), "{old}");
+    assert!(five.contains(",resumed,5,") && six.contains(",updated,6,"), "{five}{six}");
+    let page = saved(&folder, "html").into_iter().find(|(name, _)| name.contains("node-5")).unwrap().1;
+    assert!(
+        page.contains("Unterbrochenes Update") && page.contains("_node-5_000003EDh_interrupted"),
+        "{page}"
+    );
 }
 
 /// What only a log could say of a device that fails, for the report of the run.
