@@ -176,6 +176,18 @@ fn the_same_action_twice_is_flashed_once() {
     assert_eq!(fake.given().len(), 2);
 }
 
+/// Each attempt brings the same bytes again.
+#[test]
+fn a_server_that_knows_no_parts_and_breaks_off_is_given_up() {
+    let (server, folder, fake) = (Server::start(&[ID]), folder("no-parts"), Fake::default());
+    server.assign(ID, Action::new(3, &File { ranges: false, ..file() }));
+    server.fault("artifacts", 100, Fault::Cut(400));
+    let (ended, said) = once(&server, &folder, &fake, &[ID]);
+    assert_eq!((ended.updated, ended.failed), (0, 1), "{said}");
+    assert!(said.contains("cannot be fetched: ") && said.contains("(13 attempts)"), "{said}");
+    assert!(server.seen("artifacts").len() < 20 && fake.given().is_empty());
+}
+
 #[test]
 fn a_server_that_lies_about_size_or_hash_flashes_nothing() {
     let folder = folder("lies");
