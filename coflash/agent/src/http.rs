@@ -198,29 +198,17 @@ fn words(error: ureq::Error) -> String {
         }
         ureq::Error::ConnectionFailed => "there is no connection to the server".to_string(),
         error => {
-            let error = error.to_string();
-            let advice = CERTIFICATES.iter().find(|(what, _)| error.contains(what));
-            let advice = advice.map_or(String::new(), |(_, advice)| format!(": {advice}"));
-            format!("the server cannot be reached: {error}{advice}")
+            let words = error.to_string();
+            // By the name that the library has for it.
+            let advice = if words.contains("CaUsedAsEndEntity") { OWN_AUTHORITY } else { "" };
+            format!("the server cannot be reached: {words}{advice}")
         }
     }
 }
 
-/// What to do about a certificate that is not taken, by the name that the library has for the reason.
-const CERTIFICATES: [(&str, &str); 4] = [
-    (
-        "CaUsedAsEndEntity",
-        "the server's certificate is one of an authority (CA:TRUE), as openssl req -x509 makes it, and no server may \
-         have such a one: make it anew with -addext basicConstraints=critical,CA:FALSE and name it in ca-file, or let \
-         an authority sign a certificate of the server",
-    ),
-    (
-        "UnknownIssuer",
-        "name the certificate of the authority that has signed the server's one in ca-file",
-    ),
-    ("NotValidForName", "url must have a name or an address that is in the server's certificate"),
-    ("Expired", "renew the server's certificate, or set the clock of this computer"),
-];
+/// What to do about a certificate that is its own authority.
+const OWN_AUTHORITY: &str = ": the server's certificate is one of an authority (CA:TRUE), as openssl req -x509 makes \
+    it, which no server may have: make it anew with -addext basicConstraints=critical,CA:FALSE and name it in ca-file";
 
 /// Trust in the certificates of a PEM file alone.
 #[cfg(feature = "tls")]

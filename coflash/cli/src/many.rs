@@ -179,8 +179,7 @@ pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure>
 /// Keeps what is begun, before the first frame, in the record and in the file for the results.
 pub(super) fn begin(devices: &Value, report: Option<&Path>) -> Result<(), Failure> {
     record::begun(devices).map_err(Failure::system)?;
-    let document =
-        json!({ "command": "flash", "state": "begun", "began": stamp(wall()), "devices": devices });
+    let document = json!({ "command": "flash", "began": stamp(wall()), "ended": null, "begun": devices });
     report.map_or(Ok(()), |path| write_report(path, &document))
 }
 

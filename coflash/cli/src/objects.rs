@@ -64,11 +64,6 @@ pub(super) fn bytes_of(path: &Path, max: u64) -> Result<Vec<u8>, Failure> {
 }
 
 impl Names {
-    /// Whether objects have names.
-    pub(super) fn has_sheet(&self) -> bool {
-        self.eds.is_some()
-    }
-
     /// The objects that the user named.
     pub(super) fn objects(&self, words: &[String]) -> Result<Vec<Object>, Failure> {
         let eds = match &self.eds {

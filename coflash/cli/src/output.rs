@@ -385,8 +385,14 @@ impl Failure {
         let legacy = number.unwrap_or(legacy::INVALID_PARAMETER);
         // The parser quotes what it does not understand: a key after a misspelled option is one of those words.
         let kind = error.kind().as_str().unwrap_or("the parser refuses it");
-        let in_records = Some(format!("the line cannot be read: {kind}"));
-        Self { number, legacy, in_records, ..Self::bare_usage(error.render().to_string()) }
+        let failure = Self::bare_usage(error.render().to_string())
+            .in_records(&format!("the line cannot be read: {kind}"));
+        Self { number, legacy, ..failure }
+    }
+
+    /// The same failure, of which records have these words alone.
+    pub(super) fn in_records(self, words: &str) -> Self {
+        Self { in_records: Some(words.to_owned()), ..self }
     }
 
     /// An error in a recipe.

@@ -406,8 +406,8 @@ impl Machine {
             self.confirm(context, &plan)?;
         }
         given.lock(context, plan.nodes(), &mut locks)?;
-        let unended = record::unended(given.report);
-        begin(&begun(&package, &plan), given.report)?;
+        let earlier = given.report.and_then(record::document);
+        begin(&begun(&plan), given.report)?;
         let nodes: Vec<NodeId> = plan.nodes().collect();
         let board = Board::new(out, &nodes);
         let show = |node: NodeId, _, event| {
@@ -418,7 +418,7 @@ impl Machine {
         let options = RunOptions::default().flash(given.flash).many(given.many.clone());
         let outcomes = machine::run(&mut *adapter, &package, &plan, &options, &show);
         board.finish();
-        summary(context, path, &package, &plan, (outcomes, &unended), given.report)
+        summary(context, path, &package, &plan, (outcomes, earlier), given.report)
     }
 
     /// Asks the user for the start.
@@ -442,35 +442,15 @@ impl Machine {
     }
 }
 
-/// What a report says of a program of a device, or of the machine, apart from its outcome.
-fn of_program(package: &Package, plan: &Plan, node: Option<NodeId>, entry: usize) -> Value {
-    let program = package.programs().nth(entry).map(|(program, _)| program);
-    let device = plan.devices.iter().find(|device| Some(device.node) == node);
-    let mut value = json!({
-        "node": node.map(NodeId::get),
-        "name": node.map_or_else(|| "machine".to_owned(), |node| format!("node {node}")),
-        "program": program.map(|program| &program.name),
-        "image": program.map(|program| &program.file),
-    });
-    if let Some(device) = device {
-        let step = device.steps.iter().find(|step| step.entry == entry);
-        value["serial_number"] = json!(device.identity[3]);
-        value["from"] = json!(step.and_then(|step| step.from.as_ref()));
-        value["to"] = json!(step.map(|step| &step.to));
-        value["crc_tells_nothing"] = json!(step.is_some_and(|step| step.crc_tells_nothing));
-    }
-    value
-}
-
-/// What a report says of the updates of a plan before they have outcomes.
-fn begun(package: &Package, plan: &Plan) -> Value {
+/// What a plan is about to write.
+fn begun(plan: &Plan) -> Value {
     let steps = plan.devices.iter().flat_map(|device| device.steps.iter().map(move |step| (device, step)));
-    let due = steps.filter(|(_, step)| step.todo == Todo::Update).map(|(device, step)| {
-        let mut value = of_program(package, plan, Some(device.node), step.entry);
-        (value["ok"], value["state"]) = (false.into(), "begun".into());
-        value
-    });
-    due.collect()
+    let due = steps.filter(|(_, step)| step.todo == Todo::Update);
+    due.map(|(device, step)| {
+        let (node, serial, program) = (device.node.get(), device.identity[3], &step.program);
+        json!({ "node": node, "serial_number": serial, "program": program, "from": step.from, "to": step.to })
+    })
+    .collect()
 }
 
 /// Shows the outcome of each program of each device; the result of the command.
@@ -479,7 +459,7 @@ fn summary(
     path: &Path,
     package: &Package,
     plan: &Plan,
-    (outcomes, unended): (Vec<Outcome>, &[(String, Value)]),
+    (outcomes, earlier): (Vec<Outcome>, Option<Value>),
     report: Option<&Path>,
 ) -> Result<(), Failure> {
     let out = context.out;
@@ -490,24 +470,32 @@ fn summary(
     for Outcome { node, entry, result, .. } in outcomes {
         let Some((program, _)) = package.programs().nth(entry) else { continue };
         let whom = node.map_or_else(|| "machine".to_owned(), |node| format!("node {node}"));
-        let mut value = of_program(package, plan, node, entry);
-        value["ok"] = result.is_ok().into();
+        let mut value = json!({
+            "node": node.map(NodeId::get),
+            "name": whom,
+            "program": program.name,
+            "image": program.file,
+            "ok": result.is_ok(),
+        });
+        let device = plan.devices.iter().find(|device| Some(device.node) == node);
+        if let Some(device) = device {
+            let step = device.steps.iter().find(|step| step.entry == entry);
+            value["serial_number"] = json!(device.identity[3]);
+            value["from"] = json!(step.and_then(|step| step.from.as_ref()));
+            value["to"] = json!(step.map(|step| &step.to));
+            value["crc_tells_nothing"] = json!(step.is_some_and(|step| step.crc_tells_nothing));
+        }
         match result {
             Ok(Good::Had) => {
-                let parts = ["node", "serial_number", "program", "to"];
-                let is_it = |begun: &Value| parts.iter().all(|part| begun[*part] == value[*part]);
-                match unended.iter().find(|(_, begun)| is_it(begun)) {
-                    Some((began, _)) => {
-                        let words = "it has this program, from the update that began at";
-                        out.say(format_args!("{whom}: {}: {words} {began} and did not end", program.name));
-                        value["state"] = "resumed".into();
-                        value["began"] = began.as_str().into();
-                    }
-                    None => {
-                        out.say(format_args!("{whom}: {}: it had this program", program.name));
-                        value["state"] = "had".into();
-                    }
-                }
+                let began = record::unended(&value, earlier.as_ref());
+                let words = began.as_ref().map_or_else(
+                    || "it had this program".to_owned(),
+                    |began| {
+                        format!("it has this program from the update that began at {began} and did not end")
+                    },
+                );
+                out.say(format_args!("{whom}: {}: {words}", program.name));
+                value["state"] = if began.is_some() { "resumed" } else { "had" }.into();
             }
             Ok(Good::Updated(report)) => {
                 let took = report.took.as_secs_f64();

@@ -3,7 +3,6 @@
 //!
 //! One record serves the whole program, so that code with a message need not have access to it.
 
-use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -199,47 +198,40 @@ pub(super) fn begun(devices: &Value) -> Result<(), String> {
     report.write(&[("begun", devices.clone())])
 }
 
-/// The updates that were begun and did not end, each with its time: of the runs in the folder of the reports, and of
-/// `document`, the report that a run before this one has left. For each device the latest run counts.
-pub(super) fn unended(document: Option<&Path>) -> Vec<(String, Value)> {
-    let read = |path: &Path| serde_json::from_str::<Value>(&read_text(path).ok()?).ok();
-    let own = folder();
-    let folders = own.and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
-    let mut runs: Vec<PathBuf> = folders.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    runs.retain(|path| Some(path.as_path()) != own);
+/// A document that a run has written.
+pub(super) fn document(path: &Path) -> Option<Value> {
+    serde_json::from_str(&read_text(path).ok()?).ok()
+}
+
+/// When the update of a device's program was begun that did not end: of the runs in the folder of the reports and
+/// of `earlier`, the document of one more, the latest counts.
+pub(super) fn unended(device: &Value, earlier: Option<&Value>) -> Option<String> {
+    let all = folder().and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
+    let mut runs: Vec<_> = all.filter_map(|run| Some(run.ok()?.path().join(FILES[0]))).collect();
     // Their names begin with their times.
     runs.sort();
-    let of_runs = runs.iter().rev().filter_map(|run| read(&run.join(FILES[0])));
-    let document = document.and_then(read).filter(|document| document["state"] == "begun");
-    let mut seen = BTreeSet::new();
-    let mut unended = Vec::new();
-    for mut run in document.into_iter().chain(of_runs) {
-        let list = if run["state"] == "begun" { "devices" } else { "begun" };
-        let devices = run[list].take();
-        for device in devices.as_array().into_iter().flatten() {
-            let which = ["node", "serial_number", "program"].map(|part| device[part].to_string());
-            if seen.insert(which) && run["ended"].is_null() {
-                unended.push((run["began"].as_str().unwrap_or_default().to_string(), device.clone()));
-            }
-        }
-    }
-    unended
+    let is_of = |parts: &[&str], begun: &Value| parts.iter().all(|part| begun[*part] == device[*part]);
+    let mut runs = earlier.cloned().into_iter().chain(runs.iter().rev().filter_map(|run| document(run)));
+    runs.find_map(|run| {
+        let begun =
+            run["begun"].as_array()?.iter().find(|of| is_of(&["node", "serial_number", "program"], of))?;
+        let did_not_end = run["ended"].is_null() && is_of(&["to"], begun);
+        Some(did_not_end.then(|| run["began"].as_str().unwrap_or_default().to_owned()))
+    })?
 }
 
 /// Replaces a file as a whole: what it had stays if there is no room for the new contents.
 pub(super) fn replace(path: &Path, text: &str) -> io::Result<()> {
+    // A pipe, for example.
     if fs::symlink_metadata(path).is_ok_and(|there| !there.is_file()) {
         return fs::write(path, text);
     }
     let mut builder = tempfile::Builder::new();
-    // As for any new file; the user's mask takes away what he wants.
+    // As for any new file.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = match builder.tempfile_in(folder) {
-        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => return fs::write(path, text),
-        file => file?,
-    };
+    let mut file = builder.tempfile_in(folder)?;
     file.write_all(text.as_bytes())?;
     file.as_file().sync_all()?;
     file.persist(path)?;
@@ -278,8 +270,6 @@ pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send
 impl Record {
     fn note(&self, kind: &str, words: &str) {
         let time = stamp(wall());
-        // The bytes of a frame are the redactor's concern.
-        let words = &if kind == "frame" { words.to_string() } else { secrets::without_known(words) };
         for (number, line) in words.lines().enumerate() {
             let kind = if number == 0 { kind } else { "" };
             let line = format!("{time}  {kind:<7}  {line}");
@@ -310,7 +300,6 @@ impl Report {
             document[*name] = value.clone();
         }
         let path = self.folder.join(FILES[0]);
-        secrets::hide_known(&mut document);
         let text = secrets::without_urls(&format!("{:#}\n", *document));
         replace(&path, &text).map_err(|error| cannot(&path, &error))
     }

@@ -49,18 +49,22 @@ pub(super) struct Write {
 }
 
 impl Write {
-    /// The words that may be a password. What an object with a name is, only the sheet says; without one, both
-    /// words may have been exchanged.
+    /// The words that may be a password. What an object with a name is, only the sheet says, and both words may
+    /// have been exchanged.
     pub(super) fn passwords(&self) -> Vec<&str> {
         match address(&self.object) {
             Some(at) if !is_password(at) => Vec::new(),
-            None if !self.names.has_sheet() => vec![&self.value, &self.object],
-            _ => vec![&self.value],
+            Some(_) => vec![&self.value],
+            None => vec![&self.value, &self.object],
         }
     }
 
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        let object = self.names.object(&self.object)?;
+        // The word may be the password, if both were exchanged.
+        let object = self
+            .names
+            .object(&self.object)
+            .map_err(|failure| failure.in_records("there is no such object"))?;
         let bytes = self.bytes(&object)?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;

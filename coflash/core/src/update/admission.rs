@@ -47,16 +47,8 @@ enum Question<'f> {
     Size(&'f SealedFile),
 }
 
-/// Asks what runs in the device, a bootloader or an application.
-///
-/// # Errors
-/// Those of [`Admission::ask`].
-pub(super) fn admit<'f>(
-    session: &mut Session<'_>,
-    file: &'f Payload,
-    dialect: Dialect,
-    options: &FlashOptions,
-) -> Result<Admission<'f>, Error> {
+/// The questions to a device that is to get this file.
+pub(super) fn questions<'f>(file: &'f Payload, dialect: Dialect, options: &FlashOptions) -> Admission<'f> {
     let number = options.program;
     let open = match file {
         // The renewal asks the bootloader itself.
@@ -75,42 +67,32 @@ pub(super) fn admit<'f>(
         }
         Payload::Bootloader(_) => vec![],
     };
-    let mut admission = Admission { number, is_sealed_in_blocks: is_sealed_in_blocks(file, options), open };
-    admission.ask(session, dialect)?;
-    Ok(admission)
-}
-
-/// Whether the content is a sealed image that is to be sent in blocks.
-fn is_sealed_in_blocks(file: &Payload, options: &FlashOptions) -> bool {
-    matches!(file, Payload::Sealed(_)) && !file.is_bootloader() && options.blocks.is_some()
-}
-
-/// Checks whether this dialect has the way in which the content is to be sent.
-///
-/// # Errors
-/// [`Error::NotInDialect`].
-pub(super) fn judge_way(file: &Payload, dialect: Dialect, options: &FlashOptions) -> Result<(), Error> {
-    way(is_sealed_in_blocks(file, options), dialect)
-}
-
-fn way(is_sealed_in_blocks: bool, dialect: Dialect) -> Result<(), Error> {
-    let what = "a sealed image is sent in one download, not in blocks";
-    match is_sealed_in_blocks && dialect != Dialect::Block {
-        true => Err(Error::NotInDialect { dialect, what }),
-        false => Ok(()),
-    }
+    let is_sealed_in_blocks =
+        matches!(file, Payload::Sealed(_)) && !file.is_bootloader() && options.blocks.is_some();
+    Admission { number, is_sealed_in_blocks, open }
 }
 
 impl Admission<'_> {
-    /// Asks all that is open of what runs now, and checks whether this dialect has the way in which the
-    /// content is to be sent. If an application leaves an answer out, its bootloader is asked all that it
+    /// Checks what the dialect alone decides: the way in which the content is to be sent.
+    ///
+    /// # Errors
+    /// [`Error::NotInDialect`].
+    pub(super) fn judge(&self, dialect: Dialect) -> Result<(), Error> {
+        let what = "a sealed image is sent in one download, not in blocks";
+        match self.is_sealed_in_blocks && dialect != Dialect::Block {
+            true => Err(Error::NotInDialect { dialect, what }),
+            false => Ok(()),
+        }
+    }
+
+    /// [Judges](Self::judge), and asks all that is open of what runs now, a bootloader or an application. If an application leaves an answer out, its bootloader is asked all that it
     /// knows better.
     ///
     /// # Errors
     /// [`Error::NotInDialect`], [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`],
     /// [`Error::SealedOnly`], and the errors of a [read](Session::read).
     pub(super) fn ask(&mut self, session: &mut Session<'_>, dialect: Dialect) -> Result<(), Error> {
-        way(self.is_sealed_in_blocks, dialect)?;
+        self.judge(dialect)?;
         let mut has_all = true;
         for question in &self.open {
             has_all &= question.is_answered(session, dialect, self.number)?;

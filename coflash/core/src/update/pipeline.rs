@@ -8,7 +8,7 @@ use canopen::program::PROGRAM_VERSION;
 use canopen::Address;
 use shared_abi::block_file::ProgramVersion;
 
-use super::admission::{self, admit};
+use super::admission::questions;
 use super::aftermath::state_after;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
@@ -100,22 +100,18 @@ fn procedure(
     update: &mut RunningUpdate<'_>,
 ) -> Result<Report, Error> {
     let began = session.now();
-    // A dialect that the user has named decides before the first frame what options alone decide, and one that
-    // is found does so before a program is called back.
-    let judge = |session: &Session<'_>, update: &RunningUpdate<'_>, dialect| {
-        admission::judge_way(file, dialect, &update.options)?;
-        dialect::of(dialect).judge_password(session.node(), update.options.unlock)
-    };
+    // What options alone decide is decided before the first frame, or where the dialect is found.
     if let Some(dialect) = update.options.dialect {
-        judge(session, update, dialect)?;
+        questions(file, dialect, &update.options).judge(dialect)?;
+        dialect::of(dialect).judge_password(session.node(), update.options.unlock)?;
     }
     reach(session, update, |session, update| {
         let found = find(session, update)?;
-        if found.dialect != Dialect::Lift {
-            // The check of a lift names its device first.
-            judge(session, update, found.dialect)?;
+        let mut admission = questions(file, found.dialect, &update.options);
+        admission.ask(session, found.dialect)?;
+        if found.dialect == Dialect::EsAcademy {
+            dialect::of(found.dialect).judge_password(session.node(), update.options.unlock)?;
         }
-        let admission = admit(session, file, found.dialect, &update.options)?;
         // The target may be that of the device itself, as a plan has found it: only a file says more.
         if let Some(target) = update.options.check_target.filter(|target| file.target() == Some(*target)) {
             update.report(Note::TargetRight(target).into());

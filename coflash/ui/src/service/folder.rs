@@ -4,7 +4,7 @@ use std::fs::{self, OpenOptions};
 use std::io::{self, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
-use tempfile::{Builder, NamedTempFile};
+use tempfile::NamedTempFile;
 
 /// The most reports with one name: those of one device in one second.
 const SAME: u32 = 100;
@@ -44,35 +44,25 @@ impl Folder {
     /// Writes files of the size of a report's: a file system may have room in bytes, and for no more files.
     fn fill(&self, files: usize) -> io::Result<Vec<NamedTempFile>> {
         let file = |_| {
-            let mut file = Builder::new().prefix(".coflash-").tempfile_in(&self.0)?;
+            let mut file = NamedTempFile::new_in(&self.0)?;
             file.write_all(&[0; ROOM])?;
-            file.as_file().sync_all()?;
-            Ok(file)
+            file.as_file().sync_all().map(|()| file)
         };
         (0..files).map(file).collect()
     }
 
-    /// Removes the reports with this name.
-    pub(super) fn remove(&self, name: &str, endings: &[&str]) {
-        // What cannot be removed says of an update that it was begun, which is so.
-        endings.iter().for_each(|ending| drop(fs::remove_file(self.0.join(format!("{name}.{ending}")))));
+    /// The table with this ending whose name has this part, the latest one: its name, and what is in it.
+    pub(super) fn latest(&self, part: &str, ending: &str) -> Option<(String, String)> {
+        let names =
+            fs::read_dir(&self.0).ok()?.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        let name = names.filter(|name| name.contains(part) && name.ends_with(ending)).max()?;
+        let text = fs::read_to_string(self.0.join(&name)).ok()?;
+        Some((name, text))
     }
 
-    /// The reports whose names have this part: their names and what is in them. They get another part in its
-    /// place.
-    pub(super) fn rename(&self, part: &str, other: &str) -> Vec<(String, String)> {
-        let entries = fs::read_dir(&self.0).into_iter().flatten().filter_map(Result::ok);
-        let mut renamed = Vec::new();
-        for name in entries.filter_map(|entry| entry.file_name().into_string().ok()) {
-            let path = self.0.join(&name);
-            let to = self.0.join(name.replace(part, other));
-            if name.contains(part) && !to.exists() && fs::rename(&path, &to).is_ok() {
-                let name = to.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-                renamed.push((name, fs::read_to_string(&to).unwrap_or_default()));
-            }
-        }
-        renamed.sort();
-        renamed
+    /// Removes a report. One that stays says of an update that it was begun, which is so.
+    pub(super) fn remove(&self, name: &str, endings: [&str; FILES]) {
+        endings.iter().for_each(|ending| drop(fs::remove_file(self.0.join(format!("{name}.{ending}")))));
     }
 
     /// Saves contents as files of one name, each with its ending, and returns the name. No file is replaced; if one
@@ -116,8 +106,8 @@ mod tests {
     /// Two stations may save into one folder, and no report replaces another one.
     #[test]
     fn no_file_is_replaced_and_none_is_left_alone() {
-        let place = std::env::temp_dir().join(format!("coflash-folder-{}", std::process::id()));
-        let _ = fs::remove_dir_all(&place);
+        let place = tempfile::tempdir().unwrap();
+        let place = place.path();
         let folder = Folder::new(&place.join("new")).unwrap();
         let both = [("html", "h".to_owned()), ("csv", "c".to_owned())];
         assert_eq!(folder.save("a", &both).unwrap(), "a");
@@ -134,13 +124,11 @@ mod tests {
         let made = folder.fill(FILES * 2).unwrap();
         assert!(made.len() == 4 && made.iter().all(|file| file.path().exists()), "{made:?}");
         drop(made);
-        assert!(folder.check(2).is_ok());
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 7);
+        assert!(folder.check(2).is_ok() && fs::read_dir(folder.path()).unwrap().count() == 7);
         // A file where the folder was.
         fs::remove_dir_all(folder.path()).unwrap();
         fs::write(place.join("new"), "").unwrap();
         assert!(folder.check(1).is_err() && folder.save("a", &both).is_err());
         assert!(Folder::new(&place.join("new")).is_err());
-        fs::remove_dir_all(&place).unwrap();
     }
 }

@@ -62,9 +62,8 @@ pub(super) struct Report {
     is_begun: bool,
 }
 
-/// The end of the name of a report about an update that has begun, and of one that did not end.
+/// The part of the name of a report about an update that has begun.
 const BEGUN: &str = "_begun";
-const INTERRUPTED: &str = "_interrupted";
 
 /// Why reports are not saved.
 pub(super) fn unsaved(error: &io::Error, folder: &Path) -> Message {
@@ -80,16 +79,14 @@ fn of_device(row: &Row) -> String {
     node + &serial
 }
 
-/// Notes which devices have their program from an update that did not end: a report of its beginning is there, and
-/// gets the name of one that was interrupted.
+/// Notes which devices have their program from an update that did not end: its report is the latest one.
 pub(super) fn note_interrupted(rows: &mut [Row], folder: &Folder) {
-    for row in rows.iter_mut().filter(|row| !matches!(row.state, RowState::LeftOut | RowState::Failed)) {
-        let device = of_device(row);
-        let earlier = folder.rename(&format!("{device}{BEGUN}"), &format!("{device}{INTERRUPTED}"));
-        let has = |text: &String| {
-            row.steps.iter().all(|step| [&step.program, &step.to].iter().all(|word| text.contains(*word)))
-        };
-        row.interrupted = earlier.into_iter().rfind(|(_, text)| has(text)).map(|(name, _)| name);
+    for row in rows {
+        let latest = folder.latest(&of_device(row), Report::ENDINGS[1]);
+        let is_in = |text: &str, step: &Step| text.contains(&step.program) && text.contains(&step.to);
+        let is_of = |text: &str| row.steps.iter().all(|step| is_in(text, step));
+        let begun = latest.filter(|(name, text)| name.contains(BEGUN) && is_of(text));
+        row.interrupted = begun.map(|(name, _)| name);
     }
 }
 

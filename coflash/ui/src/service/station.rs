@@ -89,7 +89,7 @@ impl Station {
             match folder.save(&report.name(), &report.contents()) {
                 Ok(name) => begun.push(name),
                 Err(error) => {
-                    begun.drain(..).for_each(|name| folder.remove(&name, &Report::ENDINGS));
+                    begun.drain(..).for_each(|name| folder.remove(&name, Report::ENDINGS));
                     return Some(report::unsaved(&error, folder.path()));
                 }
             }
@@ -122,8 +122,7 @@ impl Station {
         let left = unsaved.len();
         if left == 0 {
             // The outcomes take the place of what has begun.
-            let names = std::mem::take(&mut *lock(&self.begun));
-            names.iter().for_each(|name| self.service.folder.remove(name, &Report::ENDINGS));
+            lock(&self.begun).drain(..).for_each(|name| self.service.folder.remove(&name, Report::ENDINGS));
         }
         self.change(|state| {
             state.saved.extend(saved);
