@@ -196,7 +196,7 @@ impl Output {
 
     /// Prints a failure, the last message of a command.
     pub(super) fn failure(self, failure: &Failure) {
-        let words = failure.in_records.clone().unwrap_or_else(|| failure.to_string());
+        let words = failure.unquoted().unwrap_or_else(|| failure.to_string());
         record::note("error", words.trim_end());
         if self.for_programs() {
             if !failure.is_shown {
@@ -279,8 +279,8 @@ pub(super) struct Failure {
     advice: Option<String>,
     /// The device's own answers, in words.
     answers: Vec<String>,
-    /// What records have in place of `what` and the advice, where these may quote a secret.
-    in_records: Option<String>,
+    /// What is wrong with the line, if `what` quotes words of it: one may be a secret, so records have this alone.
+    quoted: Option<ErrorKind>,
     /// Whether the document on standard output already contains the failure.
     is_shown: bool,
 }
@@ -357,7 +357,7 @@ impl Failure {
     fn new(exit: Exit, what: impl Into<String>) -> Self {
         let (legacy, what) = (exit.legacy(), what.into());
         let (number, left, advice, answers) = (None, None, None, Vec::new());
-        Self { exit, number, legacy, what, left, advice, answers, in_records: None, is_shown: false }
+        Self { exit, number, legacy, what, left, advice, answers, quoted: None, is_shown: false }
     }
 
     /// The same failure with the manual's number, which is its exit code for the manual's tools.
@@ -383,16 +383,18 @@ impl Failure {
         let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
         let number = (of_node && wrong_value).then_some(legacy::INVALID_NODE_ID);
         let legacy = number.unwrap_or(legacy::INVALID_PARAMETER);
-        // The parser quotes what it does not understand: a key after a misspelled option is one of those words.
-        let kind = error.kind().as_str().unwrap_or("the parser refuses it");
-        let failure = Self::bare_usage(error.render().to_string())
-            .in_records(&format!("the line cannot be read: {kind}"));
-        Self { number, legacy, ..failure }
+        Self { number, legacy, ..Self::bare_usage(error.render().to_string()).quoting(error.kind()) }
     }
 
-    /// The same failure, of which records have these words alone.
-    pub(super) fn in_records(self, words: &str) -> Self {
-        Self { in_records: Some(words.to_owned()), ..self }
+    /// The same failure, which quotes words of the line.
+    pub(super) fn quoting(self, kind: ErrorKind) -> Self {
+        Self { quoted: Some(kind), ..self }
+    }
+
+    /// What records have in place of words that quote the line.
+    fn unquoted(&self) -> Option<String> {
+        let kind = self.quoted?.as_str().unwrap_or_default();
+        Some(format!("the line cannot be read: {kind}"))
     }
 
     /// An error in a recipe.
@@ -517,8 +519,8 @@ impl Failure {
     /// What a record has of it.
     pub(super) fn recorded(&self) -> Value {
         let mut error = self.value()["error"].take();
-        if let Some(words) = &self.in_records {
-            error["what"] = words.as_str().into();
+        if let Some(words) = self.unquoted() {
+            error["what"] = words.into();
         }
         error
     }

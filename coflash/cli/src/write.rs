@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use clap::builder::PossibleValuesParser;
+use clap::error::ErrorKind;
 use clap::Args;
 use coboot_can::redact::is_password;
 use coflash_core::device::session::UPLOAD_MAX;
@@ -61,10 +62,8 @@ impl Write {
 
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         // The word may be the password, if both were exchanged.
-        let object = self
-            .names
-            .object(&self.object)
-            .map_err(|failure| failure.in_records("there is no such object"))?;
+        let object = self.names.object(&self.object);
+        let object = object.map_err(|failure| failure.quoting(ErrorKind::InvalidValue))?;
         let bytes = self.bytes(&object)?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
