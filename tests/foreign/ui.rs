@@ -60,6 +60,7 @@ scenarios! {
     the_page_is_readable_wide_and_narrow_in_light_and_dark "looks"
     a_service_station_updates_a_machine_by_keys_and_barcodes_and_remembers_its_adapter "service"
     a_service_station_keeps_what_it_cannot_save "service_full"
+    many_pages_leave_a_connection_and_the_browser_gets_no_token "service_tabs"
     a_service_station_offers_the_adapter_and_the_bit_rate_of_the_last_time "service_adapters"
     a_service_station_is_readable_in_both_languages "service_looks"
 }

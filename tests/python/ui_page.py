@@ -17,6 +17,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -50,10 +51,11 @@ class Bench:
             probe.bind(("127.0.0.1", 0))
             return probe.getsockname()[1]
 
-    def spawn(self, *command, until):
+    def spawn(self, *command, until, **variables):
         """Starts a program, and waits for a line with `until`; returns the program and the line."""
         # Its error messages go to this script's standard error.
-        program = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True)
+        variables = {**os.environ, **{name: str(value) for name, value in variables.items()}}
+        program = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True, env=variables)
         self.stack.callback(end, program)
         for line in program.stdout:
             if until in line:
@@ -668,6 +670,7 @@ def service(bench):
     # The first press.
     page.keyboard.press("Enter")
     stationed(page, "ready")
+    expect(page.locator("#search")).to_be_focused()
     expect(page.locator("#state")).to_have_text("Bereit")
     reach(page, "operator")
     page.keyboard.type("Jörg")
@@ -683,6 +686,8 @@ def service(bench):
     # The second press.
     press(page, "Geräte suchen")
     stationed(page, "planned")
+    # The focus goes with the work.
+    expect(page.locator("#update")).to_be_focused()
     expect(page.locator(".device")).to_have_count(2)
     expect(page.locator('.device[data-node="5"]')).to_contain_text("00000100h")
     expect(page.locator('.device[data-node="5"]')).to_contain_text("drive: kein Programm → CRC ")
@@ -703,9 +708,11 @@ def service(bench):
     # The third press.
     press(page, "2 Geräte aktualisieren")
     stationed(page, "working")
+    expect(page.locator("#stop")).to_be_focused()
     expect(page.locator('.device[data-state="state-working"]').first).to_contain_text("%")
     expect(page.locator("#device-number")).to_have_value("")
     stationed(page, "good")
+    expect(page.locator("#search")).to_be_focused()
     expect(page.locator("#number")).to_have_text("Gerätenummer: 4713")
     expect(page.locator("#saved-count")).to_have_text("2 Berichte sind gespeichert:")
     assert page.evaluate("window.tones") == 2, page.evaluate("window.tones")
@@ -814,6 +821,56 @@ def service_full(bench):
     program.send_signal(signal.SIGINT)
     assert program.wait(timeout=60) == 0
     expect(page.locator("#lost")).to_be_visible()
+
+
+@scenario
+def service_tabs(bench):
+    """The browser gets no token as an argument; seven pages leave a connection for Stop; a missing answer is said."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    package = bench.package((bench.image("drive", size=300 * 1024), f"vendor = {VENDOR}\nproduct = {PRODUCT}"))
+    browser, opened = bench.folder / "bin" / "xdg-open", bench.folder / "opened"
+    browser.parent.mkdir()
+    browser.write_text(f'#!/bin/sh\necho "$@" >{opened}.new && mv {opened}.new {opened}\n')
+    browser.chmod(0o755)
+    words = [bench.arguments.coflash, "--bus", f"socketcand://127.0.0.1:{port}/can0", "ui", "--service", package]
+    program, line = bench.spawn(*words, "--report-dir", bench.folder / "reports", until="http://127.0.0.1:",
+                                PATH=f"{browser.parent}:{os.environ['PATH']}", HOME=bench.folder)
+    url = line.split()[0]
+    while not opened.exists():
+        time.sleep(0.05)
+    door = Path(opened.read_text().strip())
+    # /proc/PID/cmdline shows the arguments to every user (proc(5)).
+    assert url.split("/")[3] not in str(door), door
+    assert door.parent == bench.folder and door.stat().st_mode & 0o777 == 0o600, door
+    first = bench.page(door.as_uri(), locale="en-GB")
+    assert first.url == url, first.url
+    stationed(first, "ready")
+    first.get_by_role("button", name="Search the devices").click()
+    tabs = [first]
+    for _ in range(6):
+        tabs.append(first.context.new_page())
+        tabs[-1].goto(url)
+        stationed(tabs[-1], "planned")
+    last = tabs[-1]
+    last.get_by_role("button", name="Update 2 devices").click()
+    for tab in tabs:
+        writing(tab)
+    last.get_by_role("button", name="Stop").click()
+    last.get_by_role("button", name="Stop the update").click()
+    for tab in tabs:
+        stationed(tab, "bad")
+    # The pages that stay do not need the one that came first.
+    first.close()
+    last.get_by_role("button", name="Search again").click()
+    stationed(last, "planned")
+    program.send_signal(signal.SIGSTOP)
+    last.get_by_role("button", name="Search again").click()
+    expect(last.locator("#message")).to_contain_text("coflash has not answered.")
+    program.send_signal(signal.SIGCONT)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(timeout=60) == 0
+    assert not door.exists(), door
 
 
 @scenario

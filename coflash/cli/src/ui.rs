@@ -1,11 +1,13 @@
 //! `coflash ui`: the page in the browser.
 
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use coflash_core::machine::{self, Package};
 use coflash_ui::{Failed, Options, Origin, Server, Service};
 use serde_json::json;
+use tempfile::NamedTempFile;
 
 use super::context::Context;
 use super::device::cancelled;
@@ -70,8 +72,9 @@ impl Ui {
         })?;
         let url = server.url();
         context.result(format_args!("{url}  (Ctrl-C ends it)"), || json!({ "url": url }));
-        if !self.no_open && open::that_detached(&url).is_err() {
-            context.out.warn("no browser was found: open the URL yourself");
+        let door = (!self.no_open).then(|| in_browser(&url));
+        if let Some(Err(error)) = &door {
+            context.out.warn(format_args!("the page is in no browser ({error}): open the URL yourself"));
         }
         let left = server
             .run(&end)
@@ -105,6 +108,23 @@ impl Ui {
         context.out.say(format_args!("reports are saved in {}", service.report_dir().display()));
         Ok(service.memory(memory::file("service-bus")))
     }
+}
+
+/// Opens the page in the browser, by a file that leads to it: every user of the computer can read the arguments of
+/// the browser, and the file is for its owner alone. It is removed when it is dropped.
+fn in_browser(url: &str) -> io::Result<NamedTempFile> {
+    let mut name = tempfile::Builder::new();
+    name.prefix("coflash-").suffix(".html");
+    // A browser in a sandbox (snap) has a folder for temporary files of its own, and reads the home folder.
+    let home = std::env::home_dir().and_then(|home| name.tempfile_in(home).ok());
+    let mut file = home.map_or_else(|| name.tempfile(), Ok)?;
+    writeln!(
+        file,
+        "<!doctype html>\n<meta charset=\"utf-8\">\n<title>coflash</title>\n\
+         <meta http-equiv=\"refresh\" content=\"0; url={url}\">\n<a href=\"{url}\">coflash</a>"
+    )?;
+    open::that_detached(file.path())?;
+    Ok(file)
 }
 
 /// Makes the package that does what a job file says, for a service station.

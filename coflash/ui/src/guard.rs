@@ -7,7 +7,7 @@
 use std::time::Duration;
 
 use axum::extract::{Request, State};
-use axum::http::{header, HeaderMap, HeaderValue, Method, StatusCode, Uri};
+use axum::http::{header, HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -59,9 +59,15 @@ impl Guard {
         if !values(header::ORIGIN).all(own_origin) {
             return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
-        // Browsers name the origin of a request: this page, or (none) the user.
-        let mut sites = headers.get_all("sec-fetch-site").iter().map(HeaderValue::as_bytes);
-        if !sites.all(|site| matches!(site, b"same-origin" | b"none")) {
+        // Browsers name the origin of a request: this page, or (none) the user. The page alone may be opened from
+        // elsewhere: the file that leads to it is of another origin.
+        let told = |name| values(HeaderName::from_static(name)).collect::<Vec<_>>();
+        let is_page = *method == Method::GET && uri.path().splitn(3, '/').nth(2) == Some("");
+        let is_opened =
+            is_page && told("sec-fetch-mode") == ["navigate"] && told("sec-fetch-dest") == ["document"];
+        let is_known = |site: &&str| matches!(*site, "same-origin" | "none");
+        let sites = told("sec-fetch-site");
+        if !sites.iter().all(is_known) && !(is_opened && sites == ["cross-site"]) {
             return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
         let shown = uri.path().strip_prefix('/').and_then(|path| path.split('/').next()).unwrap_or_default();

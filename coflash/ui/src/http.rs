@@ -100,7 +100,7 @@ impl From<Refusal> for Refused {
 }
 
 /// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 15] = [
+const FILES: [(&str, &str, &str); 16] = [
     ("", HTML, concat!(include_str!("page/head.html"), include_str!("page/index.html"))),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("colours.css", CSS, include_str!("page/colours.css")),
@@ -113,6 +113,7 @@ const FILES: [(&str, &str, &str); 15] = [
     ("events.js", SCRIPT, include_str!("page/events.js")),
     ("kept.js", SCRIPT, include_str!("page/kept.js")),
     ("reports.js", SCRIPT, include_str!("page/reports.js")),
+    ("stream.js", SCRIPT, include_str!("page/stream.js")),
     ("tabs.js", SCRIPT, include_str!("page/tabs.js")),
     ("uPlot.css", CSS, include_str!("page/uPlot.min.css")),
     ("uPlot.js", SCRIPT, include_str!("page/uPlot.iife.min.js")),

@@ -1,7 +1,10 @@
 // Requests to the server, and its stream of events.
 
 import { $, notice, text } from "./dom.js";
-import { follow } from "./events.js";
+import { follow, post } from "./events.js";
+
+/** How long the answer to a file is waited for, in milliseconds: longer than the server takes at most. */
+const FILE_PATIENCE = 70_000;
 
 /** Asks the server for something. Shows a refusal to the user; true if there was none. */
 export async function ask(what, value) {
@@ -13,19 +16,21 @@ export async function sendFile(what, file) {
   return send(`${what}?name=` + encodeURIComponent(file.name), {
     headers: { "content-type": "application/octet-stream" },
     body: file,
-  });
+  }, FILE_PATIENCE);
 }
 
-async function send(what, options) {
+async function send(what, options, patience) {
   let response;
+  let words;
   try {
-    response = await fetch(what, { method: "POST", ...options });
-  } catch {
-    notice(false, "the request did not get through", "check that coflash still runs, and try again");
+    response = await post(what, options, patience);
+    if (response.ok) return true;
+    words = await response.text();
+  } catch (error) {
+    if (error.name === "TimeoutError") notice(false, "coflash has not answered", "look whether it was done, close other pages of coflash, and try again");
+    else notice(false, "the request did not get through", "check that coflash still runs, and try again");
     return false;
   }
-  if (response.ok) return true;
-  const words = await response.text();
   try {
     const refused = JSON.parse(words);
     notice(false, refused.words, refused.advice);
@@ -46,7 +51,5 @@ export function listen(take, renew) {
     $("lost").hidden = how === null;
     if (how !== null) text($("lost"), LOST[how]);
   };
-  const events = follow("events?frames=1", take, say, renew);
-  // A browser has few connections for each server: a hidden page frees its connection for others.
-  document.addEventListener("visibilitychange", () => (document.hidden ? events.close() : events.open()));
+  follow("?frames=1", take, say, renew);
 }

@@ -25,7 +25,7 @@ use crate::http::{bad, body, done, download, idle, json_response, node_id, passw
 use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
 use crate::shared::Order;
 
-const FILES: [(&str, &str, &str); 9] = [
+const FILES: [(&str, &str, &str); 10] = [
     ("", HTML, concat!(include_str!("../page/head.html"), include_str!("page/service.html"))),
     ("colours.css", CSS, include_str!("../page/colours.css")),
     ("service.css", CSS, include_str!("page/service.css")),
@@ -34,6 +34,7 @@ const FILES: [(&str, &str, &str); 9] = [
     ("icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
     ("dom.js", SCRIPT, include_str!("../page/dom.js")),
     ("events.js", SCRIPT, include_str!("../page/events.js")),
+    ("stream.js", SCRIPT, include_str!("../page/stream.js")),
     ("kept.js", SCRIPT, include_str!("../page/kept.js")),
 ];
 

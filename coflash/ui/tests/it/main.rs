@@ -245,6 +245,15 @@ fn other_names_and_other_origins_are_turned_away() {
     ] {
         assert_eq!(ui.request("GET", &path, &[&host, line], b"").status, 403, "{line}");
     }
+    // Fetch Metadata of a browser that a file has led to the page: to the page, in a tab of its own, and to nothing else.
+    let led = ["Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate", "Sec-Fetch-Dest: document"];
+    let framed = [led[0], led[1], "Sec-Fetch-Dest: iframe"];
+    for (path, lines, status) in
+        [(&ui.path, &led[..], 200), (&path, &led, 403), (&ui.path, &framed, 403), (&ui.path, &led[..1], 403)]
+    {
+        let lines = [&[host.as_str()], lines].concat();
+        assert_eq!(ui.request("GET", path, &lines, b"").status, status, "{path} {lines:?}");
+    }
     // The name of another server with this address (DNS rebinding).
     for line in
         ["Host: evil.example", &format!("Host: evil.example:{port}"), "Host: 127.0.0.1", "Host: ", "X: y"]

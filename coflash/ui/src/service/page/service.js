@@ -1,7 +1,7 @@
 // The page of a service station. The server decides; the page shows it in the user's language and sends requests.
 
 import { $, el, text } from "./dom.js";
-import { follow } from "./events.js";
+import { follow, post } from "./events.js";
 import { keep, keepField, kept } from "./kept.js";
 
 const FIELDS = ["operator", "order", "device-number"];
@@ -28,6 +28,8 @@ let sent = null;
 /** The device number of the update at work, which comes back if no device was changed. */
 let taken = "";
 let sound = null;
+/** What had the focus last; null until the user goes somewhere. */
+let place = null;
 let shown = "";
 
 /** The text with this key in the language of the user. */
@@ -84,6 +86,18 @@ function show(next) {
   text($("saved-count"), state.saved.length === 1 ? t("saved-one") : t("saved-many", { count: state.saved.length }));
   $("saved").hidden = state.saved.length === 0;
   $("saved-names").replaceChildren(...state.saved.map((name) => el("li", {}, el("code", {}, `${name}.html, .csv`))));
+  focus();
+}
+
+/**
+ * What had the focus may be hidden or switched off now: the focus goes to what is to be done next, so that a person at the
+ * keys does not begin at the top of the page. A plan with faults is looked at first: its next step is another search.
+ */
+function focus() {
+  const takes = (element) => element.checkVisibility() && !element.disabled;
+  if (place === null || $("confirm").open || takes(place)) return;
+  const next = ["stop", "save", state.station === "planned" ? "update" : "search", "search", "connect", "change"];
+  next.map($).find(takes)?.focus();
 }
 
 /**
@@ -226,23 +240,23 @@ function play(isGood) {
 
 /** Asks the server for something. Shows a refusal to the user; true if there was none. */
 async function ask(what, value = {}) {
-  let response = null;
+  let said = t("refused");
+  let told = "";
   try {
-    response = await fetch(what, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(value) });
-  } catch {
-    // The server is gone.
+    const response = await post(what, { headers: { "content-type": "application/json" }, body: JSON.stringify(value) });
+    if (response.ok) return true;
+    told = await response.text();
+  } catch (error) {
+    said = error.name === "TimeoutError" ? t("no-answer") : t("not-sent");
   }
-  if (response?.ok) return true;
-  const detail = response ? await response.text() : "";
-  let told = detail;
   try {
-    told = JSON.parse(detail).words;
+    told = JSON.parse(told).words;
   } catch {
     // It is not one of the page's own refusals.
   }
   $("message").hidden = false;
   $("message").dataset.now = "";
-  $("message").replaceChildren(el("p", {}, response ? t("refused") : t("not-sent")), el("p", { class: "detail", lang: "en" }, told));
+  $("message").replaceChildren(el("p", {}, said), el("p", { class: "detail", lang: "en" }, told));
   return false;
 }
 
@@ -315,6 +329,7 @@ function offer() {
 }
 
 function start() {
+  document.addEventListener("focusin", (event) => (place = event.target));
   $("search").addEventListener("click", () => ask("search"));
   $("save").addEventListener("click", () => ask("save"));
   // A browser allows sounds from a click on.
@@ -349,4 +364,4 @@ function start() {
 offer();
 start();
 translate();
-follow("events", (told) => { if (told.state) show(told.state); }, (how) => ($("lost").hidden = how === null));
+follow("", (told) => { if (told.state) show(told.state); }, (how) => ($("lost").hidden = how === null));
