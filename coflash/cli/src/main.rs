@@ -182,8 +182,13 @@ fn main() -> ExitCode {
     let error = failure.map(Failure::recorded);
     let kept = record::end(failure.map_or(0, |failure| out.code(failure)), error);
     let kept = kept.map_err(Failure::system);
-    let result = result.and_then(|()| kept.inspect_err(|failure| out.failure(failure)));
-    match result {
+    // The first failure is the result; that the report is not whole is said with it.
+    match (&result, &kept) {
+        (Ok(()), Err(failure)) => out.failure(failure),
+        (Err(_), Err(failure)) => out.warn(failure),
+        _ => {}
+    }
+    match result.and(kept) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => out.exit(&failure),
     }

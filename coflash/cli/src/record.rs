@@ -293,7 +293,7 @@ impl Report {
         }
     }
 
-    /// Writes `report.json` with these additional entries.
+    /// Writes `report.json` with these additional entries. If there is no room for it, that of before stays.
     fn write(&self, entries: &[(&str, Value)]) -> Result<(), String> {
         let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, value) in entries {

@@ -106,7 +106,10 @@ impl Ui {
             Failure::usage(what, "name another folder with --report-dir")
         })?;
         context.out.say(format_args!("reports are saved in {}", service.report_dir().display()));
-        Ok(service.memory(memory::file("service-bus")))
+        let memory = memory::file("service-bus");
+        let forgets =
+            |why: &String| context.out.warn(format_args!("the adapter is chosen anew at each start: {why}"));
+        Ok(service.memory(memory.inspect_err(forgets).ok()))
     }
 }
 

@@ -30,7 +30,10 @@ impl Shell {
     /// Reads commands and runs each of them with `command`.
     pub(crate) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
-        let history = interactive.then(|| memory::file("history")).flatten();
+        let history = interactive.then(|| memory::file("history")).and_then(|history| {
+            let lost = |why: &String| context.out.warn(format_args!("this shell leaves no history: {why}"));
+            history.inspect_err(lost).ok()
+        });
         let mut editor = DefaultEditor::new()
             .map_err(|error| Failure::system(format!("the line editor does not start: {error}")))?;
         if let Some(history) = &history {

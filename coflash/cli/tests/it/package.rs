@@ -1,6 +1,7 @@
 //! Packages for machines: their recipe, and the command line.
 
 use std::fs;
+use std::net::TcpListener;
 use std::path::Path;
 
 use canopen::NodeId;
@@ -8,7 +9,7 @@ use coflash_core::device::lss::LssAddress;
 use coflash_core::file::sealed::{Sealer, SigningKey};
 use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
-use crate::tool::{coflash, data, folder, Done};
+use crate::tool::{coflash, command, data, folder, run, Done};
 use kit::fake::{serve, Fake, APPLICATION};
 use kit::folder::Folder;
 use serde_json::{json, Value};
@@ -293,6 +294,13 @@ fn what_contradicts_a_package_is_refused() {
     ] {
         coflash(words).fails(exit, &[error]);
     }
+    // What a station cannot remember is said before it serves anything: here the place of its folder is a file.
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let words =
+        ["ui", "--service", package, "--no-open", "--port", &port, "--report-dir", &line.at("reports")];
+    let told = ["the adapter is chosen anew at each start", "make that folder writable", "cannot be served"];
+    run(command().env("XDG_STATE_HOME", &root).args(words)).fails(1, &told);
 }
 
 /// A run that was killed has left what it had begun, in its report or in the folder of the reports: the next run does

@@ -421,6 +421,27 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     );
 }
 
+/// The report of the beginning stays when there is no room for that of the end.
+#[cfg(unix)]
+#[test]
+fn a_folder_that_fills_up_keeps_the_report_that_it_has() {
+    let folder = folder("full");
+    let mut device = bootloader();
+    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
+    let (url, _device) = serve(device);
+    let tool = command();
+    // POSIX: the limit of a file's size, in units of 512 bytes.
+    let mut limited = Command::new("sh");
+    limited.args(["-c", r#"trap '' XFSZ; ulimit -f 2; exec "$@""#, "sh"]).arg(tool.get_program());
+    limited.envs(tool.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    let image = data("plain-400.blk");
+    let words = ["flash", &image, "-N", "5", "--bus", &url, "--report-dir", "reports"];
+    let done = run(limited.current_dir(folder.path("")).args(words));
+    let path = runs(&folder).pop().unwrap().join("report.json");
+    let report: Value = serde_json::from_slice(&fs::read(path).unwrap()).unwrap();
+    assert!(report["ended"].is_null() && done.err.contains("report.json: cannot be written"), "{}", done.err);
+}
+
 /// The agent's failed update is in its report as that of `flash` is, and the server gets the device's answer. The
 /// report is there while the agent goes on.
 #[test]
