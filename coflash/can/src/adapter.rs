@@ -7,7 +7,7 @@ use std::time::Duration;
 use canopen::frame::Channel;
 use canopen::{AbortCode, Address, Frame};
 
-use super::health::Health;
+use super::health::{Health, Losses};
 
 /// A CAN bus and its clock.
 ///
@@ -37,6 +37,12 @@ pub trait Adapter {
     /// The call may query the system, so use it only after something has gone wrong.
     fn health(&mut self) -> Option<Health> {
         None
+    }
+
+    /// What did not go through the adapter so far, as far as it knows. Unlike [`health`](Self::health),
+    /// this asks nobody.
+    fn losses(&self) -> Losses {
+        Losses::default()
     }
 
     /// The group downloads in which this conversation can take part.
@@ -97,6 +103,10 @@ macro_rules! by_pointer {
                 (**self).health()
             }
 
+            fn losses(&self) -> Losses {
+                (**self).losses()
+            }
+
             fn group(&mut self) -> Option<&mut dyn Group> {
                 (**self).group()
             }
@@ -107,7 +117,8 @@ macro_rules! by_pointer {
 by_pointer!(&mut A, Box<A>);
 
 /// The URLs that [`open`](super::open()) accepts, for messages and help texts.
-pub const URLS: &str = "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE, slcan:tcp://HOST:PORT@BITRATE, \
+pub const URLS: &str =
+    "socketcan:INTERFACE (Linux), slcan:PORT@BITRATE?baud=SPEED, slcan:tcp://HOST:PORT@BITRATE, \
                         peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE, gs_usb:NUMBER@BITRATE, \
                         socketcand://HOST:PORT/BUS, cia309://HOST:PORT/NET (gateway, SDO alone)";
 

@@ -43,8 +43,7 @@ pub struct Health {
     pub unacknowledged: u32,
     /// Bit, stuff, form and CRC errors.
     pub disturbed: u32,
-    /// Errors of an unknown kind: socketcand sends the class of an error frame alone, and an SLCAN
-    /// adapter refuses a frame without a reason.
+    /// Errors of an unknown kind: socketcand sends the class of an error frame alone.
     pub unclear: u32,
     /// What an adapter has sent that is not of its protocol.
     pub strange: u32,
@@ -54,6 +53,47 @@ pub struct Health {
     pub counters: Option<(u8, u8)>,
     /// The bit rate in bit/s, where it is known.
     pub bit_rate: Option<u32>,
+    /// What did not go through the adapter.
+    pub losses: Losses,
+}
+
+/// What did not go through an adapter since it was opened. `Display` has what a user should know.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Losses {
+    /// Frames that it refused; they were sent again in their order, if it answers each frame.
+    pub refused: u32,
+    /// Frames that it did not answer, although it answers others.
+    pub lost: u32,
+    /// Restarts after which its bus was opened again.
+    pub restarts: u32,
+}
+
+impl Losses {
+    /// Those since the time of `before`.
+    #[must_use]
+    pub const fn since(self, before: Self) -> Self {
+        Self {
+            refused: self.refused.wrapping_sub(before.refused),
+            lost: self.lost.wrapping_sub(before.lost),
+            restarts: self.restarts.wrapping_sub(before.restarts),
+        }
+    }
+}
+
+impl fmt::Display for Losses {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let times = |count| if count == 1 { "once".to_string() } else { format!("{count} times") };
+        let frames = |count| if count == 1 { "1 frame".to_string() } else { format!("{count} frames") };
+        let Self { refused, lost, restarts } = *self;
+        let all = [
+            (restarts, format!("has restarted {}, and its bus was opened again", times(restarts))),
+            (refused, format!("has refused {}, and they were sent again", frames(refused))),
+            (lost, format!("has not answered {}", frames(lost))),
+        ];
+        let all: Vec<String> =
+            all.into_iter().filter(|(count, _)| *count > 0).map(|(_, words)| words).collect();
+        write!(f, "the adapter {}", all.join("; it "))
+    }
 }
 
 /// The problem of a bus.
@@ -71,6 +111,8 @@ pub enum Trouble {
     Passive,
     /// There are errors, and the adapter does not report their kind.
     Unclear,
+    /// The adapter has restarted.
+    Restarted,
     /// The adapter speaks another protocol than when it was opened.
     Strange,
     /// The server returns the tool's own frames, and nobody else sends any.
@@ -105,6 +147,7 @@ impl Health {
             }
             _ if passive => Some(Trouble::Passive),
             _ if self.unclear > 0 => Some(Trouble::Unclear),
+            _ if self.losses.restarts > 0 => Some(Trouble::Restarted),
             _ if self.strange > 0 => Some(Trouble::Strange),
             _ if self.only_echoes => Some(Trouble::Echo),
             _ => None,
@@ -152,6 +195,7 @@ impl Health {
                  bit rate is wrong{rate}; check power, cable, terminators and bit rate",
                 self.unclear_errors()
             ),
+            Trouble::Restarted => format!("{}: check its supply, its cable and the USB hub, and try again", self.losses),
             Trouble::Strange => {
                 "the adapter sends what is not of its protocol, and no frames: it was reset, or something else is at this \
                  port or address; unplug it and plug it in again, or check the URL of the bus"
@@ -168,13 +212,14 @@ impl Health {
     /// The problem and the advice, if frames of other nodes arrive although it exists.
     #[must_use]
     pub fn disturbance(&self) -> Option<String> {
-        match self.trouble()? {
-            Trouble::Off | Trouble::Disturbed => self.advice(),
-            Trouble::Unclear => Some(format!(
+        match self.trouble() {
+            Some(Trouble::Off | Trouble::Disturbed | Trouble::Restarted) => self.advice(),
+            Some(Trouble::Unclear) => Some(format!(
                 "the adapter has reported {} of the bus: check the bit rate of each node, cable and terminators",
                 self.unclear_errors()
             )),
-            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive | Trouble::Strange | Trouble::Echo => None,
+            _ if self.losses.refused > 0 => Some(self.losses.to_string()),
+            _ => None,
         }
     }
 

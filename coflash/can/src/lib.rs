@@ -45,7 +45,7 @@ pub use self::adapter::{Adapter, AdapterError, Obstacle, URLS};
 pub use self::cia309::Cia309;
 pub use self::found::{Found, Kind, Missing};
 pub use self::gateway::{Gateway, GatewayError};
-pub use self::health::Health;
+pub use self::health::{Health, Losses};
 pub use self::link::Link;
 pub use self::list::{list, List};
 pub use self::open::{bit_rate_of, check, open, open_at};

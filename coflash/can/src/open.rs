@@ -40,7 +40,7 @@ pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Sen
     Ok(match target(url)? {
         Target::Socketcand { server, bus } => Box::new(Socketcand::connect(&server, &bus)?),
         Target::SlcanTcp { server, rate } => Box::new(Slcan::connect(&server, rate.or(bit_rate))?),
-        Target::SlcanPort { port, rate } => Box::new(Slcan::serial(&port, rate.or(bit_rate))?),
+        Target::SlcanPort { port, rate, baud } => Box::new(Slcan::serial(&port, baud, rate.or(bit_rate))?),
         #[cfg(target_os = "linux")]
         Target::SocketCan { interface } => Box::new(SocketCan::open(&interface)?),
         Target::Driver { kind, which, rate } => {

@@ -6,7 +6,7 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
 use super::adapter::{Adapter, AdapterError};
-use super::health::Health;
+use super::health::{Health, Losses};
 
 /// An adapter for devices that use their own identifiers for SDO requests and answers
 /// (`BLCOP_BASE_REQUEST` and `BLCOP_BASE_RESPONSE` of the manual). The adapter's user sees the
@@ -75,6 +75,10 @@ impl<A: Adapter> Adapter for SdoIds<A> {
 
     fn health(&mut self) -> Option<Health> {
         self.adapter.health()
+    }
+
+    fn losses(&self) -> Losses {
+        self.adapter.losses()
     }
 }
 

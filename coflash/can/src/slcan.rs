@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::TcpStream;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
@@ -12,11 +13,14 @@ use shared_abi::bxcan::data_length;
 use super::adapter::{Adapter, AdapterError};
 use super::digits::{hex_bytes, hex_number};
 use super::echo::Echoes;
-use super::health::{Controller, Health};
+use super::health::{Controller, Health, Losses};
 use super::ports;
 use super::tcp::{connect, waits, PATIENCE};
 
 mod opening;
+mod sending;
+
+use self::sending::Sending;
 
 /// How long an adapter may take to answer a command. Some adapters never answer, but work.
 const ANSWER: Duration = Duration::from_millis(300);
@@ -25,8 +29,11 @@ const ANSWER: Duration = Duration::from_millis(300);
 const LONGEST_MESSAGE: usize = 64;
 /// The most frames that are kept while the tool waits for an answer, or for their echoes.
 const MOST_EARLY: usize = 1024;
-/// The speed of a serial line; adapters on USB ignore it.
-const BAUD: u32 = 115_200;
+/// The speed of a serial line in bit/s, if the URL has none; adapters on USB ignore it.
+pub(super) const BAUD: u32 = 115_200;
+/// A wait that is shorter than the clocks of some systems can tell is made of such pauses.
+const SHORT: Duration = Duration::from_millis(5);
+const SLICE: Duration = Duration::from_micros(100);
 
 /// The line that carries the text.
 pub trait Line: Read + Write {
@@ -35,6 +42,15 @@ pub trait Line: Read + Write {
     /// # Errors
     /// The line is gone.
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()>;
+
+    /// Reads what arrives within this time.
+    ///
+    /// # Errors
+    /// Nothing has arrived, or the line is gone.
+    fn read_within(&mut self, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
+        self.set_timeout(timeout)?;
+        self.read(bytes)
+    }
 
     /// The time on the clock of the line's other end.
     fn now(&self) -> Instant {
@@ -46,6 +62,24 @@ impl Line for TcpStream {
     fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
         // Zero would mean no time-out.
         self.set_read_timeout(Some(timeout.max(Duration::from_micros(1))))
+    }
+
+    /// The system rounds a time-out up to its tick of some milliseconds.
+    fn read_within(&mut self, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
+        if timeout >= SHORT {
+            self.set_timeout(timeout)?;
+            return self.read(bytes);
+        }
+        self.set_nonblocking(true)?;
+        let end = Instant::now() + timeout;
+        let read = loop {
+            match self.read(bytes) {
+                Err(error) if waits(&error) && Instant::now() < end => thread::sleep(SLICE),
+                read => break read,
+            }
+        };
+        self.set_nonblocking(false)?;
+        read
     }
 }
 
@@ -61,6 +95,8 @@ pub struct Slcan<L: Line> {
     line: L,
     name: String,
     opened: Instant,
+    /// When the last bytes came.
+    heard: Instant,
     /// Received bytes of an incomplete message.
     partial: Vec<u8>,
     /// Received bytes that were not parsed yet.
@@ -71,8 +107,12 @@ pub struct Slcan<L: Line> {
     echoes: bool,
     /// Frames that were sent and did not come back yet, if the adapter echoes.
     sent: Echoes<MOST_EARLY>,
-    /// Frames that the adapter has refused: its queue is full, or its bus is closed.
-    refused: u32,
+    /// Frames on their way into the adapter's queue.
+    sending: Sending,
+    /// The command for the bit rate, if the tool sets it.
+    rate: Option<String>,
+    /// The speed of the line, if it is a serial port.
+    baud: Option<u32>,
     /// Lines outside the protocol that came since the bus is open.
     strange: u32,
     /// The first line outside the protocol that came while the adapter was opened.
@@ -95,22 +135,25 @@ impl Slcan<TcpStream> {
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
     pub fn connect(server: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         let name = format!("SLCAN adapter {server}");
-        Self::open(connect(&name, server, None, PATIENCE)?, name, bit_rate)
+        let line = connect(&name, server, None, PATIENCE)?;
+        Self::opened(line, name).open_bus(bit_rate)
     }
 }
 
 impl Slcan<Box<dyn serialport::SerialPort>> {
-    /// Opens the serial port `port` and the bus of its adapter.
+    /// Opens the serial port `port` at `baud` bit/s and the bus of its adapter.
     ///
     /// # Errors
     /// [`AdapterError::Open`] or [`AdapterError::Protocol`].
-    pub fn serial(port: &str, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
+    pub fn serial(port: &str, baud: u32, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
         let name = format!("SLCAN adapter {port}");
-        let line = serialport::new(port, BAUD)
+        let line = serialport::new(port, baud)
             .timeout(PATIENCE)
             .open()
             .map_err(|error| ports::refused(name.clone(), port, &error))?;
-        Self::open(line, name, bit_rate)
+        let mut adapter = Self::opened(line, name);
+        adapter.baud = Some(baud);
+        adapter.open_bus(bit_rate)
     }
 }
 
@@ -119,6 +162,10 @@ impl<L: Line> Slcan<L> {
     pub fn opened(line: L, name: String) -> Self {
         Self {
             opened: line.now(),
+            heard: line.now(),
+            sending: Sending::new(line.now()),
+            rate: None,
+            baud: None,
             line,
             name,
             partial: Vec::new(),
@@ -126,7 +173,6 @@ impl<L: Line> Slcan<L> {
             early: VecDeque::new(),
             echoes: false,
             sent: Echoes::default(),
-            refused: 0,
             strange: 0,
             odd: None,
         }
@@ -144,6 +190,7 @@ impl<L: Line> Slcan<L> {
 
     /// The status flags; `None` if the adapter does not send them.
     fn flags(&mut self) -> Result<Option<u32>, AdapterError> {
+        self.settle()?;
         self.send_text("F\r")?;
         let deadline = self.line.now() + ANSWER;
         while let Some(Message::Text(text)) = self.message(deadline)? {
@@ -159,8 +206,8 @@ impl<L: Line> Slcan<L> {
     }
 
     fn send_text(&mut self, text: &str) -> Result<(), AdapterError> {
-        let done = self.line.write_all(text.as_bytes()).and_then(|()| self.line.flush());
-        done.map_err(|error| self.lost(error))
+        self.write_text(text)?;
+        self.line.flush().map_err(|error| self.lost(error))
     }
 
     /// The next message; `None` if the deadline has passed.
@@ -172,13 +219,15 @@ impl<L: Line> Slcan<L> {
             let left = deadline.saturating_duration_since(self.line.now());
             let mut bytes = [0; 4096];
             // After the deadline the line is read once more: data may have arrived already.
-            let read = self.line.set_timeout(left).and_then(|()| self.line.read(&mut bytes));
-            match read {
+            match self.line.read_within(&mut bytes, left) {
                 Ok(0) => {
                     let closed = io::Error::new(ErrorKind::ConnectionAborted, "the line was closed");
                     return Err(self.lost(closed));
                 }
-                Ok(len) => self.rest.extend_from_slice(&bytes[..len]),
+                Ok(len) => {
+                    self.heard = self.line.now();
+                    self.rest.extend_from_slice(&bytes[..len]);
+                }
                 Err(error) if waits(&error) => {}
                 Err(error) => return Err(self.lost(error)),
             }
@@ -233,54 +282,45 @@ impl<L: Line> Drop for Slcan<L> {
 
 impl<L: Line> Adapter for Slcan<L> {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        if self.echoes {
-            self.sent.sent(frame);
-        }
-        self.send_text(&text_of(frame))
+        self.hand_over(frame)
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        if let Some(frame) = self.early.pop_front() {
-            return Ok(Some(frame));
-        }
         let deadline = self.line.now() + timeout;
-        while let Some(message) = self.message(deadline)? {
-            match message {
-                // Acknowledgements (z, Z, empty) are ignored.
-                Message::Text(text) => {
-                    let frame = parse_frame(&text);
-                    if frame.is_none() && !is_of_protocol(&text) {
-                        self.strange = self.strange.saturating_add(1);
-                    }
-                    if let Some(frame) = frame.filter(|frame| !self.sent.takes(frame)) {
-                        return Ok(Some(frame));
-                    }
-                }
-                // A frame that the adapter refused counts as lost on the bus: its sender misses the
-                // answer and repeats it.
-                Message::Refused => self.refused = self.refused.saturating_add(1),
+        loop {
+            if let Some(frame) = self.early.pop_front() {
+                return Ok(Some(frame));
             }
+            let until = self.sending.due().map_or(deadline, |due| due.min(deadline));
+            let message = self.message(until)?;
+            if let Some(frame) = message.as_ref().and_then(|message| self.hear(message)) {
+                return Ok(Some(frame));
+            }
+            self.go_on()?;
             if self.line.now() >= deadline {
-                break;
+                return Ok(self.early.pop_front());
             }
         }
-        Ok(None)
     }
 
     fn now(&self) -> Duration {
         self.line.now().saturating_duration_since(self.opened)
     }
 
-    /// Reads the status flags (`F`), which not all adapters know, and adds the refused frames.
+    /// Reads the status flags (`F`), which not all adapters know.
     fn health(&mut self) -> Option<Health> {
         let controller = self.flags().ok().flatten().map(|flags| match flags {
             flags if flags & PASSIVE != 0 => Controller::Passive,
             flags if flags & WARNING != 0 => Controller::Warning,
             _ => Controller::Active,
         });
-        let (unclear, strange) = (self.refused, self.strange);
-        let known = controller.is_some() || unclear > 0 || strange > 0;
-        known.then_some(Health { controller, unclear, strange, ..Health::default() })
+        let (losses, strange) = (self.losses(), self.strange);
+        let known = controller.is_some() || losses != Losses::default() || strange > 0;
+        known.then_some(Health { controller, losses, strange, ..Health::default() })
+    }
+
+    fn losses(&self) -> Losses {
+        self.sending.losses
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use canopen::Frame;
 
 use super::adapter::{Adapter, AdapterError};
-use super::health::Health;
+use super::health::{Health, Losses};
 
 /// A function that gets each frame: the wall clock since 1970, the frame, and whether this tool has
 /// sent it.
@@ -65,5 +65,9 @@ impl<A: Adapter> Adapter for Tap<A> {
 
     fn health(&mut self) -> Option<Health> {
         self.adapter.health()
+    }
+
+    fn losses(&self) -> Losses {
+        self.adapter.losses()
     }
 }

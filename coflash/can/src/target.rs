@@ -4,14 +4,15 @@ use super::adapter::{NO_ADAPTER, NO_SCHEME};
 use super::digits::decimal;
 use super::drivers::driver;
 use super::found::Kind;
+use super::slcan::BAUD;
 
 /// The target of a URL.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Target {
     /// A bus of a socketcand server.
     Socketcand { server: String, bus: String },
-    /// An SLCAN adapter on a serial port.
-    SlcanPort { port: String, rate: Option<u32> },
+    /// An SLCAN adapter on a serial port with this speed in bit/s.
+    SlcanPort { port: String, rate: Option<u32>, baud: u32 },
     /// An SLCAN adapter over TCP.
     SlcanTcp { server: String, rate: Option<u32> },
     /// An interface of the Linux kernel.
@@ -38,6 +39,11 @@ impl Target {
     /// What is wrong with the URL, as a sentence about it.
     pub(super) fn parse(url: &str) -> Result<Self, String> {
         let Some((scheme, rest)) = url.split_once(':') else { return Err(no_scheme(url)) };
+        if scheme != "slcan" && rest.contains("?baud=") {
+            return Err(
+                "only slcan:PORT has a serial line, and with it a speed: leave out ?baud=".to_string()
+            );
+        }
         let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
         match scheme {
             "socketcand" => {
@@ -52,8 +58,12 @@ impl Target {
                 Ok(Self::Socketcand { server: server.to_string(), bus: bus.to_string() })
             }
             "slcan" => {
+                let (rest, baud) = with_baud(rest)?;
                 let (line, rate) = with_rate(rest)?;
                 match line.strip_prefix("tcp://") {
+                    Some(_) if baud.is_some() => {
+                        Err("TCP has no speed of a serial line: leave out ?baud=".to_string())
+                    }
                     Some(server) if word(server) && server.contains(':') => {
                         Ok(Self::SlcanTcp { server: server.to_string(), rate })
                     }
@@ -61,7 +71,7 @@ impl Target {
                     None if line.is_empty() => {
                         Err("it names no serial port: slcan:/dev/ttyACM0@500k".to_string())
                     }
-                    None => Ok(Self::SlcanPort { port: line.to_string(), rate }),
+                    None => Ok(Self::SlcanPort { port: line.to_string(), rate, baud: baud.unwrap_or(BAUD) }),
                 }
             }
             "socketcan" => interface(rest),
@@ -125,6 +135,21 @@ fn with_driver(kind: Kind, rest: &str) -> Result<Target, String> {
     Ok(Target::Driver { kind, which: which.to_string(), rate })
 }
 
+/// The text before `?baud=`, and the speed of the serial line in bit/s after it.
+fn with_baud(text: &str) -> Result<(&str, Option<u32>), String> {
+    let Some((before, query)) = text.split_once('?') else { return Ok((text, None)) };
+    let baud = query.strip_prefix("baud=").and_then(parse_speed).filter(|baud| BAUDS.contains(baud));
+    match baud {
+        Some(baud) => Ok((before, Some(baud))),
+        None => Err("the speed of its serial line must be like ?baud=57600, and at the end: \
+                     slcan:PORT@500k?baud=57600"
+            .to_string()),
+    }
+}
+
+/// The speeds of serial lines that exist, in bit/s.
+const BAUDS: std::ops::RangeInclusive<u32> = 300..=12_000_000;
+
 /// The text before the last `@`, and the bit rate after it.
 fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
     let Some((before, rate)) = text.rsplit_once('@') else { return Ok((text, None)) };
@@ -164,8 +189,13 @@ fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
     }
 }
 
-/// `500k`, `1M`, `125000`, in bit/s.
+/// A bit rate of CAN: `500k`, `1M`, `125000`, in bit/s.
 fn parse_bit_rate(text: &str) -> Option<u32> {
+    parse_speed(text).filter(|rate| (1..=1_000_000).contains(rate))
+}
+
+/// `500k`, `1M`, `125000`, in bit/s.
+fn parse_speed(text: &str) -> Option<u32> {
     let (digits, unit) = match text.strip_suffix(['k', 'K']) {
         Some(digits) => (digits, 1000),
         None => match text.strip_suffix('M') {
@@ -173,7 +203,7 @@ fn parse_bit_rate(text: &str) -> Option<u32> {
             None => (text, 1),
         },
     };
-    decimal::<u32>(digits)?.checked_mul(unit).filter(|rate| (1..=1_000_000).contains(rate))
+    decimal::<u32>(digits)?.checked_mul(unit)
 }
 
 fn is_port(text: &str) -> bool {
@@ -208,9 +238,12 @@ mod tests {
     #[test]
     fn urls_name_adapters() {
         let rate = Some(500_000);
+        let port = |port: &str, rate, baud| Target::SlcanPort { port: port.to_string(), rate, baud };
         for (url, target) in [
-            ("slcan:COM7@500k", Target::SlcanPort { port: "COM7".to_string(), rate }),
-            ("slcan:/dev/ttyACM0", Target::SlcanPort { port: "/dev/ttyACM0".to_string(), rate: None }),
+            ("slcan:COM7@500k", port("COM7", rate, 115_200)),
+            ("slcan:/dev/ttyACM0", port("/dev/ttyACM0", None, 115_200)),
+            ("slcan:COM7@500k?baud=57600", port("COM7", rate, 57_600)),
+            ("slcan:COM7?baud=3M", port("COM7", None, 3_000_000)),
             ("slcan:tcp://[::1]:7@500000", Target::SlcanTcp { server: "[::1]:7".to_string(), rate }),
             ("cia309://host:7", Target::Gateway { server: "host:7".to_string(), network: 1 }),
             ("cia309://host/65535", Target::Gateway { server: "host".to_string(), network: 65535 }),
@@ -239,6 +272,11 @@ mod tests {
             ("slcan:/dev/ttyACM0@500kbit", "did you mean 500k?"),
             ("slcan:/dev/ttyACM0@1Mbit/s", "did you mean 1M?"),
             ("slcan:/dev/ttyACM0@1m", "did you mean 1M?"),
+            ("slcan:COM7?baud=57600@500k", "at the end: slcan:PORT@500k?baud=57600"),
+            ("slcan:COM7@500k?baud=0", "must be like ?baud=57600"),
+            ("slcan:COM7@500k?speed=57600", "must be like ?baud=57600"),
+            ("slcan:tcp://host:7@500k?baud=57600", "TCP has no speed"),
+            ("socketcan:can0?baud=57600", "only slcan:PORT has a serial line"),
             ("slcan:/dev/ttyACM0@2M", "must be like 125k, 500k or 1M"),
             ("slcan:/dev/ttyACM0@2000000", "CAN goes up to 1M"),
             ("slcan:/dev/ttyACM0@", "must be like 125k"),

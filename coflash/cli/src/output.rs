@@ -612,7 +612,7 @@ impl From<Error> for Failure {
     fn from(error: Error) -> Self {
         let exit = match &error {
             Error::Adapter(AdapterError::Url { .. }) => Exit::Usage,
-            Error::Adapter(_) => Exit::Adapter,
+            Error::Adapter(_) | Error::NoVerdict { .. } => Exit::Adapter,
             Error::Cancelled => Exit::Cancelled,
             Error::NotInDialect { .. } | Error::NoPassword { .. } => Exit::Usage,
             Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,

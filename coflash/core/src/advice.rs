@@ -235,6 +235,9 @@ advice! {
         another program[ (coflash more catch --node {node} waits for it)|]; the program may crash or have a wrong \
         bit rate; [for one that answers under another node-ID than its bootloader there is --no-trial|one \
         that answers under another node-ID than its bootloader is updated without Trial run first]",
+    /// For an adapter that failed while a program was tried.
+    NoVerdict => "the program may be right: check the supply of the adapter, its cable and the USB hub, then \
+        [run the command|update the device] again; over UART without CAN, the device itself is the adapter",
     /// For a program on trial that does not return.
     GiveWayBack { node: NodeId } => "give the program 1F51h = 80h, the way back into the bootloader \
         (docs/application.md): without it the device can never be updated over the bus. [Reset the device \

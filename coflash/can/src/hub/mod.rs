@@ -11,6 +11,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::sync::mpsc::{channel, Receiver, Sender};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -24,6 +25,7 @@ pub use self::line::Options;
 use self::line::{Answer, Item, Line, Reply, State};
 use self::turns::Turns;
 use super::adapter::{Adapter, AdapterError, Delivery, Group};
+use super::health::Losses;
 
 mod group;
 mod line;
@@ -66,6 +68,8 @@ pub struct Port {
     now: Duration,
     asks: Sender<Ask>,
     answers: Receiver<Answer>,
+    /// Those of the adapter, at the time of the last answer.
+    losses: Arc<Mutex<Losses>>,
 }
 
 impl Port {
@@ -100,6 +104,10 @@ impl Adapter for Port {
 
     fn now(&self) -> Duration {
         self.now
+    }
+
+    fn losses(&self) -> Losses {
+        *self.losses.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn group(&mut self) -> Option<&mut dyn Group> {
@@ -154,6 +162,7 @@ pub fn run<'c, R: Send + 'c>(
     let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
     let (asks, asked) = channel();
     let (done, results) = channel();
+    let losses = Arc::new(Mutex::new(adapter.losses()));
     let mut lines: Vec<Option<Line>> = (0..count).map(|_| None).collect();
     thread::scope(|scope| {
         let mut lost = None;
@@ -169,7 +178,8 @@ pub fn run<'c, R: Send + 'c>(
                 // More devices than a group has are updated alone.
                 let part = part.filter(|_| number < SERVERS_MAX);
                 let (now, asks) = (adapter.now(), asks.clone());
-                let mut port = Port { number, channel: part, now, asks, answers: answered };
+                let losses = losses.clone();
+                let mut port = Port { number, channel: part, now, asks, answers: answered, losses };
                 let done = done.clone();
                 lines[number] = Some(Line { node, channel: part, answers, state: State::Running });
                 scope.spawn(move || {
@@ -185,7 +195,7 @@ pub fn run<'c, R: Send + 'c>(
             if lost.is_none() {
                 lost = downloads.go_on(adapter, &mut lines, is_complete).err();
             }
-            serve(adapter, &nodes, &mut lines, &mut downloads, &mut turns, &mut lost);
+            serve(adapter, &nodes, &mut lines, &mut downloads, &mut turns, (&mut lost, &losses));
         }
     });
     drop(done);
@@ -256,7 +266,7 @@ fn serve(
     lines: &mut [Option<Line>],
     downloads: &mut GroupDownloads,
     turns: &mut Turns,
-    lost: &mut Option<AdapterError>,
+    (lost, losses): (&mut Option<AdapterError>, &Mutex<Losses>),
 ) {
     let waiting = |line: &Line| match line.state {
         State::Waiting { until } => Some(until),
@@ -268,12 +278,13 @@ fn serve(
     let in_turn = lines.iter().enumerate().filter(|(port, _)| !turns.hold(*port));
     let deadlines = in_turn.filter_map(|(_, line)| waiting(line.as_ref()?));
     let deadlines = deadlines.chain(downloads.deadline()).chain(turns.deadline());
-    let received = match (&lost, deadlines.min()) {
+    let received = match (&*lost, deadlines.min()) {
         (Some(error), _) => Err(error.clone()),
         (None, None) => return,
         (None, Some(earliest)) => adapter.receive(earliest.saturating_sub(adapter.now())),
     };
     let now = adapter.now();
+    *losses.lock().unwrap_or_else(PoisonError::into_inner) = adapter.losses();
     if let Ok(Some(frame)) = &received {
         downloads.hear(frame, lines, now);
     }

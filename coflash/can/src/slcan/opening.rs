@@ -24,11 +24,11 @@ use crate::found::shown;
 use crate::ports;
 
 /// The same for an adapter that answers, but too late for the order of the commands.
-const LATE_ANSWER: Duration = Duration::from_secs(1);
+pub(super) const LATE_ANSWER: Duration = Duration::from_secs(1);
 /// How long the line must be silent until a late adapter has answered all commands.
 const QUIET: Duration = Duration::from_millis(500);
 /// How long more text of an answer is waited for. Converters from USB hold back text for 16 ms.
-const REST: Duration = Duration::from_millis(30);
+pub(super) const REST: Duration = Duration::from_millis(30);
 /// How long the commands are repeated for an adapter that is silent at first. The last attempt
 /// begins after 2.4 s or later: by then an adapter that restarts has started.
 const START: Duration = Duration::from_secs(3);
@@ -42,7 +42,7 @@ const BIT_RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 
 
 /// The answer to a command, as far as the protocol defines it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Answer {
+pub(super) enum Answer {
     /// CR: done.
     Done,
     /// BEL: refused.
@@ -52,10 +52,10 @@ enum Answer {
 }
 
 /// What came back after a command.
-struct Reply {
-    answer: Answer,
+pub(super) struct Reply {
+    pub(super) answer: Answer,
     /// Lines outside the protocol.
-    words: Vec<String>,
+    pub(super) words: Vec<String>,
 }
 
 /// The result of an attempt.
@@ -77,7 +77,7 @@ enum Outcome {
 
 /// What an attempt has shown.
 #[derive(Default)]
-struct Heard {
+pub(super) struct Heard {
     /// It sent a version of the protocol, or a frame.
     is_certain: bool,
     /// It acknowledged or refused a command.
@@ -107,21 +107,23 @@ impl<L: Line> Slcan<L> {
     /// that leaves open what it did. [`AdapterError::Protocol`] if it refuses. [`AdapterError::Lost`] if the
     /// line fails.
     pub fn open(line: L, name: String, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
-        let mut adapter = Self::opened(line, name);
-        let rate = match bit_rate {
-            Some(rate) => Some(adapter.rate_command(rate)?),
-            None => None,
-        };
-        let end = adapter.line.now() + START;
+        Self::opened(line, name).open_bus(bit_rate)
+    }
+
+    /// Opens the bus; the errors are those of [`open`](Self::open).
+    pub(super) fn open_bus(mut self, bit_rate: Option<u32>) -> Result<Self, AdapterError> {
+        self.rate = bit_rate.map(|rate| self.rate_command(rate)).transpose()?;
+        let end = self.line.now() + START;
         let (mut before, mut window) = (None, ANSWER);
         for _ in 0..ATTEMPTS {
             let mut heard = Heard::default();
-            let outcome = adapter.attempt(rate.as_deref(), window, &mut heard)?;
+            let outcome = self.attempt(window, &mut heard)?;
+            self.sending.opened(bit_rate, heard.answers);
             if outcome == Outcome::Open {
-                return Ok(adapter);
+                return Ok(self);
             }
             let is_final = match outcome {
-                Outcome::Unknown => adapter.line.now() >= end,
+                Outcome::Unknown => self.line.now() >= end,
                 outcome => before == Some(outcome),
             };
             before = Some(outcome);
@@ -129,13 +131,13 @@ impl<L: Line> Slcan<L> {
                 break;
             }
             if heard.lives {
-                adapter.drain()?;
+                self.drain()?;
             }
             if heard.lives && !heard.talks_first {
                 window = LATE_ANSWER;
             }
         }
-        adapter.judged(before, rate.as_deref().unwrap_or("S"))
+        self.judged(before)
     }
 
     /// The command for a bit rate.
@@ -147,12 +149,7 @@ impl<L: Line> Slcan<L> {
     }
 
     /// Closes the bus, asks for the version, sets the bit rate and opens the bus.
-    fn attempt(
-        &mut self,
-        rate: Option<&str>,
-        window: Duration,
-        heard: &mut Heard,
-    ) -> Result<Outcome, AdapterError> {
+    fn attempt(&mut self, window: Duration, heard: &mut Heard) -> Result<Outcome, AdapterError> {
         // The first C ends a line that an earlier session left incomplete. An empty line would do
         // the same, but some firmwares repeat their last command for it. An adapter whose bus is
         // closed refuses C, which does no harm.
@@ -164,8 +161,8 @@ impl<L: Line> Slcan<L> {
         // Frames of a bus that was open before belong to an earlier session.
         self.early.clear();
         self.ask_name(window, heard)?;
-        let set = match rate {
-            Some(rate) => self.ask(rate, window, heard)?.answer,
+        let set = match self.rate.clone() {
+            Some(rate) => self.ask(&rate, window, heard)?.answer,
             None => Answer::None,
         };
         let open = self.ask("O", window, heard)?.answer;
@@ -174,7 +171,7 @@ impl<L: Line> Slcan<L> {
             (Answer::Refused, _) => Outcome::RefusesRate,
             (_, Answer::Refused) => Outcome::RefusesOpen,
             (Answer::Done, Answer::None) => Outcome::OpenUnanswered,
-            (Answer::None, Answer::Done) if rate.is_some() => Outcome::RateUnanswered,
+            (Answer::None, Answer::Done) if self.rate.is_some() => Outcome::RateUnanswered,
             _ if heard.talks => Outcome::OpenWithWords,
             _ => Outcome::Open,
         })
@@ -193,7 +190,12 @@ impl<L: Line> Slcan<L> {
     }
 
     /// Sends a command, and collects what comes back within `window`.
-    fn ask(&mut self, command: &str, window: Duration, heard: &mut Heard) -> Result<Reply, AdapterError> {
+    pub(super) fn ask(
+        &mut self,
+        command: &str,
+        window: Duration,
+        heard: &mut Heard,
+    ) -> Result<Reply, AdapterError> {
         self.send_text(&format!("{command}\r"))?;
         let end = self.line.now() + window;
         let rest = if window > ANSWER { QUIET } else { REST };
@@ -256,7 +258,8 @@ impl<L: Line> Slcan<L> {
     }
 
     /// The result of the attempts, of which the last had this outcome, as an adapter or an error.
-    fn judged(self, outcome: Option<Outcome>, rate: &str) -> Result<Self, AdapterError> {
+    fn judged(self, outcome: Option<Outcome>) -> Result<Self, AdapterError> {
+        let rate = self.rate.as_deref().unwrap_or("S");
         let changes = |done: &str, undone: &str| {
             let what = format!("it acknowledges {done}, but not {undone}");
             let advice =
@@ -282,9 +285,15 @@ impl<L: Line> Slcan<L> {
             None if self.echoes => "; it sent back what it got".to_string(),
             None => String::new(),
         };
-        let what = format!("it answered neither V (version) nor O (open the bus) as an adapter does{said}");
+        let at = self.baud.map_or(String::new(), |baud| format!(" at {baud} bit/s"));
+        let what =
+            format!("it answered neither V (version) nor O (open the bus){at} as an adapter does{said}");
+        let speed = match self.baud {
+            Some(_) => "an adapter with a UART may have another speed: append, for example, ?baud=57600 to the URL; or ",
+            None => "",
+        };
         let advice = format!(
-            "this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb",
+            "{speed}this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb",
             ports::those_there()
         );
         AdapterError::unusable(&self.name, Obstacle::Absent, what, advice)

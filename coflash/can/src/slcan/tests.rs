@@ -80,6 +80,45 @@ struct Device {
     /// The lines it received.
     lines: Vec<String>,
     gone: bool,
+    /// How long a byte takes on the way to it, and when the last one is there.
+    byte: Duration,
+    arrived: Duration,
+    /// Its queue, if frames are to reach a bus.
+    queue: Option<Queue>,
+}
+
+/// The queue of an adapter of the manual, and the bus behind it.
+struct Queue {
+    open: bool,
+    size: usize,
+    /// How long a frame takes on the bus, and when those in the queue are through.
+    frame: Duration,
+    ends: VecDeque<Duration>,
+    bus: Vec<String>,
+}
+
+impl Queue {
+    fn new(size: usize, frame: Duration) -> Self {
+        Self { open: false, size, frame, ends: VecDeque::new(), bus: Vec::new() }
+    }
+
+    fn answer(&mut self, line: &str, at: Duration) -> String {
+        let was_open = self.open;
+        self.ends.retain(|end| *end > at);
+        match line.chars().next() {
+            Some('t') if self.open && self.ends.len() < self.size => {
+                self.ends.push_back(self.ends.back().map_or(at, |end| *end) + self.frame);
+                self.bus.push(line.to_string());
+                return "z\r".to_string();
+            }
+            Some('O') => self.open = true,
+            Some('C') => self.open = false,
+            Some('S') => {}
+            Some('V') => return "V1013\r".to_string(),
+            _ => return "\x07".to_string(),
+        }
+        if was_open == line.starts_with('C') { "\r" } else { "\x07" }.to_string()
+    }
 }
 
 const fn ms(ms: u64) -> Duration {
@@ -103,7 +142,14 @@ impl Device {
             line: String::new(),
             lines: Vec::new(),
             gone: false,
+            byte: Duration::ZERO,
+            arrived: Duration::ZERO,
+            queue: None,
         }
+    }
+
+    fn queue(size: usize, frame: Duration) -> Self {
+        Self { queue: Some(Queue::new(size, frame)), ..Self::new(nothing) }
     }
 
     fn slow(answers: Answers, latency: u64) -> Self {
@@ -164,6 +210,7 @@ impl Write for Device {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.talk(self.now);
         for byte in bytes {
+            self.arrived = self.arrived.max(self.now) + self.byte;
             if self.now < self.starts {
                 continue;
             }
@@ -172,8 +219,11 @@ impl Write for Device {
                 continue;
             }
             let line = std::mem::take(&mut self.line);
-            let answer = (self.answers)(&line, self.lines.len());
-            let at = self.busy.map_or(self.now, |busy| busy.max(self.now)) + self.latency;
+            let answer = match &mut self.queue {
+                Some(queue) => queue.answer(&line, self.arrived),
+                None => (self.answers)(&line, self.lines.len()),
+            };
+            let at = self.busy.map_or(self.arrived, |busy| busy.max(self.arrived)) + self.latency;
             self.busy = self.busy.map(|_| at);
             self.coming.extend(answer.bytes().map(|byte| (at, byte)));
             self.lines.push(line);
@@ -432,6 +482,13 @@ fn an_adapter_that_refuses_or_changes_its_mind_is_named() {
     let mut device = Device::new(|line, n| turns(lawicel, 3, modem, line, n));
     let error = open(&mut device, Some(125_000)).map(drop).unwrap_err().to_string();
     assert!(error.contains("it sent 'ERROR'"), "{error}");
+    // A UART may have another speed.
+    let mut device = Device::new(nothing);
+    let mut bus = Slcan::opened(&mut device, "SLCAN adapter test".to_string());
+    bus.baud = Some(115_200);
+    let error = bus.open_bus(None).map(drop).unwrap_err();
+    assert!(error.to_string().contains("O (open the bus) at 115200 bit/s as"), "{error}");
+    assert!(error.advice().contains("append, for example, ?baud=57600 to the URL"), "{}", error.advice());
     let mut gone = Device { gone: true, ..Device::new(lawicel) };
     let error = open(&mut gone, None).map(drop).unwrap_err();
     assert!(matches!(error, AdapterError::Lost { .. }), "{error}");
@@ -502,20 +559,139 @@ fn an_echo_is_no_frame_of_the_bus() {
     assert_eq!(bus.receive(ms(20)).unwrap(), None);
 }
 
-/// It takes commands, and refuses frames: nobody acknowledges them, and its queue is full.
-#[test]
-fn refused_frames_are_errors_of_the_bus() {
-    let mut device = Device::new(|line, number| but("t", "\x07", line, number));
-    let mut bus = open(&mut device, None).unwrap();
-    for _ in 0..3 {
-        bus.send(&frame(0x605, &[0x40])).unwrap();
-        assert_eq!(bus.receive(ms(20)).unwrap(), None);
+/// Sends sub-blocks of an SDO block download; returns what has reached the bus, the time, and what was refused.
+fn sub_blocks(size: usize, rate: u32, latency: u64, baud: u32) -> (Vec<String>, Duration, u32) {
+    let mut device = Device::queue(size, Duration::from_secs(125) / rate);
+    (device.latency, device.byte) = (Duration::from_micros(latency), Duration::from_secs(10) / baud);
+    let mut bus = open(&mut device, Some(rate)).unwrap();
+    let begun = bus.line.now;
+    for segment in 0..8 * 127_u32 {
+        let [.., high, low] = segment.to_be_bytes();
+        bus.send(&frame(0x605, &[high, low, 2, 3, 4, 5, 6, 7])).unwrap();
+        if segment % 127 == 126 {
+            // The device answers when it has all of them.
+            bus.settle().unwrap();
+            let end = bus.line.queue.as_ref().unwrap().ends.back().copied().unwrap_or_default();
+            bus.line.now = bus.line.now.max(end) + ms(1);
+        }
     }
-    let health = bus.health().unwrap();
-    assert_eq!((health.controller, health.unclear), (Some(Controller::Active), 3));
-    assert!(!health.acknowledged());
-    bus.line.answers = nothing;
-    assert_eq!(bus.health().unwrap().unclear, 3);
+    let (time, refused) = (bus.line.now - begun, bus.losses().refused);
+    drop(bus);
+    (device.queue.unwrap().bus, time, refused)
+}
+
+/// What fits into the queue while its answer is on the way keeps the bus busy.
+#[test]
+fn a_refused_frame_is_sent_again_in_its_order() {
+    let sent: Vec<String> = (0..8 * 127).map(|segment| format!("t6058{segment:04X}020304050607")).collect();
+    for (rate, latency, baud, sizes) in [
+        (125_000, 100, 12_000_000, &[3, 16, 64][..]),
+        (500_000, 100, 12_000_000, &[3, 16, 64]),
+        (1_000_000, 100, 12_000_000, &[3, 16, 64]),
+        // USB, and converters from USB with their 16 ms.
+        (125_000, 1_000, 12_000_000, &[3, 16, 64]),
+        (500_000, 1_000, 12_000_000, &[16, 64]),
+        (125_000, 16_000, 3_000_000, &[64]),
+        (125_000, 16_000, 1_000_000, &[64]),
+        (125_000, 1_000, 1_000_000, &[3, 16, 64]),
+        (125_000, 1_000, 115_200, &[3, 16, 64]),
+        (125_000, 1_000, 57_600, &[3, 16, 64]),
+    ] {
+        let (all, free, none) = sub_blocks(10_000, rate, latency, baud);
+        assert_eq!((&all, none), (&sent, 0));
+        for size in sizes {
+            let at = format!("{size} frames, {rate} bit/s, {latency} us, {baud} baud");
+            let (mut bus, time, refused) = sub_blocks(*size, rate, latency, baud);
+            assert!(time.as_secs_f64() <= 1.3 * free.as_secs_f64(), "{at}: {time:?}, not {free:?}");
+            assert!(refused <= sent.len() as u32 / 2, "{at}: {refused} refused");
+            // Only frames whose answers were on their way when another one was refused are not in their place.
+            let late = bus.iter().zip(&sent).filter(|(there, sent)| there != sent).count();
+            assert!(late <= if latency < 250 { 0 } else { 20 }, "{at}: {late} late");
+            bus.sort();
+            assert_eq!(bus, sent, "{at}");
+        }
+    }
+}
+
+/// A restart closes the bus: all frames are refused, and some adapters greet.
+#[test]
+fn an_adapter_that_has_restarted_is_opened_again() {
+    for text in ["", "\r\nCAN init ok!\r\n"] {
+        let mut device = Device::queue(3, ms(1));
+        let mut bus = open(&mut device, Some(125_000)).unwrap();
+        bus.send(&frame(0x605, &[0x40])).unwrap();
+        assert_eq!((bus.receive(ms(20)).unwrap(), bus.losses()), (None, Losses::default()));
+        let (now, lines) = (bus.line.now, bus.line.lines.len());
+        bus.line.queue.as_mut().unwrap().open = false;
+        bus.line.coming.extend(text.bytes().map(|byte| (now, byte)));
+        assert_eq!(bus.receive(ms(100)).unwrap(), None);
+        bus.send(&frame(0x605, &[0x60])).unwrap();
+        assert_eq!(bus.receive(ms(500)).unwrap(), None);
+        assert_eq!(bus.losses().restarts, 1, "{text:?}");
+        assert_eq!(bus.losses().refused > 0, text.is_empty(), "{text:?}");
+        let advice = bus.health().unwrap().advice().unwrap();
+        assert!(
+            advice.starts_with("the adapter has restarted once, and its bus was opened again"),
+            "{advice}"
+        );
+        drop(bus);
+        let again = &device.lines[lines..];
+        assert!(again.iter().any(|line| line == "S4"), "{again:?}");
+        assert_eq!(device.queue.unwrap().bus, ["t605140", "t605160"], "{text:?}");
+    }
+    // One that acknowledges nothing.
+    let mut device = Device::new(quiet);
+    let mut bus = open(&mut device, Some(125_000)).unwrap();
+    let now = bus.line.now;
+    bus.line.coming.extend(b"USB CAN v1\r".iter().map(|byte| (now, *byte)));
+    assert_eq!(bus.receive(ms(200)).unwrap(), None);
+    assert_eq!(bus.losses().restarts, 1);
+    // Its frames need no answers.
+    let now = bus.line.now;
+    for _ in 0..500 {
+        bus.send(&frame(0x605, &[0x60])).unwrap();
+    }
+    assert_eq!((bus.line.now, bus.losses().lost), (now, 0));
+}
+
+/// Nobody acknowledges on the bus, so its queue stays full.
+#[test]
+fn an_adapter_that_goes_on_to_refuse_is_stuck() {
+    let mut device = Device::queue(3, Duration::from_secs(9999));
+    let mut bus = open(&mut device, Some(125_000)).unwrap();
+    for _ in 0..4 {
+        bus.send(&frame(0x605, &[0x40])).unwrap();
+    }
+    let error = bus.receive(ms(5_000)).unwrap_err();
+    assert!(matches!(error, AdapterError::Stuck { .. }), "{error}");
+    assert!(error.advice().contains("no other node acknowledges"), "{}", error.advice());
+    assert!((bus.losses().refused > 10) && bus.losses().restarts == 0, "{:?}", bus.losses());
+    assert!(bus.line.now < ms(5_000), "{:?}", bus.line.now);
+}
+
+/// The answers wait in the line until the computer wakes; a queue that was full has room then.
+#[test]
+fn an_hour_of_sleep_is_no_silence_of_the_adapter() {
+    let mut device = Device::queue(3, ms(1));
+    let mut bus = open(&mut device, Some(125_000)).unwrap();
+    for _ in 0..50 {
+        for _ in 0..5 {
+            bus.send(&frame(0x605, &[0x40])).unwrap();
+        }
+        bus.line.now += Duration::from_secs(3600);
+    }
+    bus.settle().unwrap();
+    assert_eq!((bus.losses().lost, bus.losses().restarts), (0, 0));
+    drop(bus);
+    assert_eq!(device.queue.unwrap().bus.len(), 250);
+    // One that does not answer any more is another matter.
+    let mut device = Device::queue(3, ms(1));
+    let mut bus = open(&mut device, Some(125_000)).unwrap();
+    bus.send(&frame(0x605, &[0x40])).unwrap();
+    bus.settle().unwrap();
+    bus.line.queue = None;
+    bus.send(&frame(0x605, &[0x40])).unwrap();
+    assert_eq!((bus.receive(ms(2_000)).unwrap(), bus.losses().lost), (None, 1));
 }
 
 /// An adapter that becomes something else in the middle of a session: a gateway, a boot loader, a modem.

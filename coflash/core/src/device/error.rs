@@ -16,7 +16,7 @@ use super::doing::{Doing, LssDoing};
 use super::state::{reason, source, trial_end, BootloaderState};
 use crate::advice::Advice;
 use coboot_can::gateway::GatewayError;
-use coboot_can::AdapterError;
+use coboot_can::{AdapterError, Losses};
 
 mod advice;
 
@@ -226,6 +226,14 @@ pub enum Error {
         node: NodeId,
         /// The kind of failure.
         how: TrialFailure,
+    },
+    /// The adapter failed while the program was tried or started, so that its silence says nothing.
+    #[error("no verdict on the program of node {node}: while it was started and watched, {losses}")]
+    NoVerdict {
+        /// The device.
+        node: NodeId,
+        /// What did not go through the adapter.
+        losses: Losses,
     },
     /// The program does not start.
     #[error(
@@ -470,6 +478,21 @@ impl Error {
         matches!(self, Self::Refused { .. } | Self::Failed { code: Some(_), .. })
     }
 
+    /// Whether this is the silence of a program that was started: the adapter may be its reason.
+    pub(crate) const fn is_silence(&self) -> bool {
+        matches!(
+            self,
+            Self::NoAnswer { .. }
+                | Self::FellSilent { .. }
+                | Self::SilentOnTrial { .. }
+                | Self::StartFailed { running: None, .. }
+                | Self::TrialFailed {
+                    how: TrialFailure::Silent(_) | TrialFailure::FellSilent(_) | TrialFailure::Lost(_),
+                    ..
+                }
+        )
+    }
+
     /// Whether the device has refused block 0 or the first block with data. A device that erases
     /// when it receives the first good block has then lost nothing.
     #[must_use]
@@ -514,6 +537,7 @@ impl Error {
     pub const fn number(&self) -> u32 {
         match self {
             Self::Adapter(error) => error.number(),
+            Self::NoVerdict { .. } => 0x6000_0303,
             Self::WrongCrc { .. } => 0x6000_0001,
             Self::Failed { error, .. } => flash_error_number(*error),
             Self::WrongTarget { what, .. } => flash_error_number(what.error()),

@@ -67,8 +67,9 @@ fn open(path: &Path) -> Option<File> {
     OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path).ok()
 }
 
-/// The same name for every URL of a bus: the bit rate after `@` is left out.
+/// The same name for every URL of a bus: the bit rate after `@` is left out, and the speed after `?`.
 fn name(url: &str, node: NodeId) -> String {
+    let url = url.split('?').next().unwrap_or_default();
     let bus = url.rsplit_once('@').map_or(url, |(bus, _)| bus);
     format!("coflash-{:016x}-{node}.lock", Crc::<u64>::new(&CRC_64_XZ).checksum(bus.as_bytes()))
 }
@@ -84,6 +85,7 @@ mod tests {
         let node = |number| NodeId::new(number).unwrap();
         let take = |url: &str, number| Lock::in_folder(&folder, url, node(number));
         let held = take("slcan:/dev/ttyACM0@500k", 5).unwrap();
+        assert!(take("slcan:/dev/ttyACM0?baud=57600", 5).is_err());
         let error = take("slcan:/dev/ttyACM0", 5).unwrap_err();
         let this = std::process::id();
         assert!(

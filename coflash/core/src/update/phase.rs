@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use canopen::NodeId;
+use coboot_can::Losses;
 use serde::Serialize;
 
 use crate::advice::Advice;
@@ -181,6 +182,13 @@ pub enum Warning {
     },
     /// The device has not answered for a while, and the tool waits for it.
     Silent(Silence),
+    /// The adapter has refused frames, or has restarted.
+    Adapter {
+        /// The frames that it refused.
+        refused: u32,
+        /// Its restarts.
+        restarts: u32,
+    },
 }
 
 impl fmt::Display for Phase {
@@ -279,6 +287,9 @@ impl fmt::Display for Warning {
                 write!(f, "what the device had of this program is not usable ({why}): sending everything")
             }
             Self::Silent(silence) => silence.fmt(f),
+            Self::Adapter { refused, restarts } => {
+                Losses { refused: *refused, restarts: *restarts, lost: 0 }.fmt(f)
+            }
         }
     }
 }

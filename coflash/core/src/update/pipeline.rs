@@ -23,6 +23,7 @@ use super::steps::compare_crc;
 use super::watch;
 use crate::device::error::reported;
 use crate::device::{Dialect, Error, Session};
+use coboot_can::Losses;
 
 /// Updates a device: detects what runs there, calls the bootloader, and gives it the program, the sealed
 /// image, which is sent unchanged, or the bootloader.
@@ -56,8 +57,9 @@ pub(super) fn flash_knowing(
     on_event: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
     let (result, node, transfers) = reporting_silence(session, on_event, |session, on_event| {
+        let before = session.losses();
         let mut update = RunningUpdate::new(session.node(), *options, known, on_event);
-        let result = procedure(session, file, &mut update);
+        let result = procedure(session, file, &mut update).map_err(|error| update.judged(session, error));
         let left = match &result {
             Ok(_) => DeviceAfterUpdate { state: update.known.state, answer: DeviceAnswer::NotAsked },
             Err(error) => state_after(session, error, &update, options.program, file.crcs()),
@@ -67,6 +69,10 @@ pub(super) fn flash_knowing(
         }
         if let DeviceAnswer::Given(_) = left.answer {
             update.known.state = left.state;
+        }
+        let Losses { refused, restarts, .. } = session.losses().since(before);
+        if refused > 0 || restarts > 0 {
+            update.report(Warning::Adapter { refused, restarts }.into());
         }
         update.report(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())
@@ -131,9 +137,11 @@ fn procedure(
         None if options.start => {
             let time = watch::time(session, dialect, &options)?;
             update.report(Phase::Starting.into());
+            update.losses = Some(session.losses());
             let starts = session.now();
             let running = procedure.start(session, update.original, options.program)?;
             watch::watch(session, starts, time)?;
+            update.verdict(session)?;
             update.report(Phase::Started(running).into());
             Some(running)
         }

@@ -3,13 +3,14 @@
 use std::cell::RefCell;
 
 use canopen::NodeId;
+use coboot_can::Losses;
 
 use super::device_after::DeviceState;
 use super::event::{Event, Note, Phase, Warning};
 use super::options::FlashOptions;
 use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
-use crate::device::{Dialect, Session};
+use crate::device::{Dialect, Error, Session};
 
 /// Carries out `work` in a session that reports silence of the node as an event.
 pub(super) fn reporting_silence<R>(
@@ -85,6 +86,8 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) known: &'t mut Known,
     /// The program that was called back to the bootloader for this update.
     pub(super) called: Option<u8>,
+    /// What had not gone through the adapter when a program was started, to be watched.
+    pub(super) losses: Option<Losses>,
     /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
     /// The devices with which it gets its data together, as reported.
@@ -110,6 +113,7 @@ impl<'t> RunningUpdate<'t> {
             dialect: Dialect::Block,
             known,
             called: None,
+            losses: None,
             mastership: None,
             together: 0,
             disturbed: false,
@@ -125,6 +129,32 @@ impl<'t> RunningUpdate<'t> {
         let runs = running == Some(self.options.program) && known.state == DeviceState::Erased;
         if runs || matches!(known.state, DeviceState::Untouched | DeviceState::Begun) {
             (known.state, known.wrote) = (DeviceState::Called, false);
+        }
+    }
+
+    /// What has not gone through the adapter since a program was started.
+    fn lost(&self, session: &Session<'_>) -> Losses {
+        self.losses.map_or(Losses::default(), |before| session.losses().since(before))
+    }
+
+    /// The result of the start of a program: an adapter that has restarted may have lost its end.
+    ///
+    /// # Errors
+    /// [`Error::NoVerdict`].
+    pub(super) fn verdict(&self, session: &Session<'_>) -> Result<(), Error> {
+        match self.lost(session) {
+            losses if losses.restarts > 0 => Err(Error::NoVerdict { node: session.node(), losses }),
+            _ => Ok(()),
+        }
+    }
+
+    /// The same error; silence that may be the adapter's is no verdict on the program.
+    pub(super) fn judged(&self, session: &Session<'_>, error: Error) -> Error {
+        match self.lost(session) {
+            losses if losses != Losses::default() && error.is_silence() => {
+                Error::NoVerdict { node: session.node(), losses }
+            }
+            _ => error,
         }
     }
 

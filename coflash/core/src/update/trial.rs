@@ -14,6 +14,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
     let bootloader = identity(session)?;
     let time = watch::time(session, Dialect::Block, &options)?;
     update.report(Phase::TrialStarting.into());
+    update.losses = Some(session.losses());
     let began = session.now();
     let running = start(session, options.program).map_err(failed)?;
     watch::watch(session, began, time).map_err(failed)?;
@@ -25,6 +26,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
     let back = call_back(session).map_err(failed);
     right?;
     back?;
+    update.verdict(session)?;
     update.report(Phase::TrialPassed(running).into());
     Ok(())
 }

@@ -10,7 +10,7 @@ use super::message::Message;
 /// The message of an error.
 pub(super) fn of_error(error: &Error) -> Message {
     let key = match error {
-        Error::Adapter(_) => "trouble-adapter",
+        Error::Adapter(_) | Error::NoVerdict { .. } => "trouble-adapter",
         Error::Cancelled => "trouble-cancelled",
         Error::NoAnswer { .. } | Error::ShortAnswer { .. } => "trouble-no-answer",
         Error::NoPassword { .. } => "trouble-password",

@@ -18,6 +18,7 @@ impl Error {
     pub fn advice(&self) -> Advice {
         match *self {
             Self::Adapter(ref error) => error.into(),
+            Self::NoVerdict { .. } => Advice::NoVerdict,
             Self::Cancelled => Advice::Continue,
             Self::NoAnswer { node, .. } => Advice::Reach { node },
             Self::ShortAnswer { .. } => Advice::ShortAnswer,

@@ -15,7 +15,7 @@ use super::error::Error;
 use super::timing::{Timing, Transfers};
 use coboot_can::adapter::Adapter;
 use coboot_can::gateway::Gateway;
-use coboot_can::{Health, Link};
+use coboot_can::{Health, Link, Losses};
 
 mod attention;
 mod listen;
@@ -204,6 +204,15 @@ impl<'a> Session<'a> {
         match &mut self.access {
             Access::Bus(adapter) => adapter.health(),
             Access::Gateway(_) => None,
+        }
+    }
+
+    /// What did not go through the adapter so far.
+    #[must_use]
+    pub fn losses(&self) -> Losses {
+        match &self.access {
+            Access::Bus(adapter) => adapter.losses(),
+            Access::Gateway(_) => Losses::default(),
         }
     }
 

@@ -60,6 +60,7 @@ impl Procedure for Renew {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         (update.known.state, update.known.touched) = (DeviceState::Called, true);
+        update.losses = Some(session.losses());
         let result = renew(session, file, update);
         // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in
         // a device that is silent; the next power-on starts it there.

@@ -164,6 +164,12 @@ fn the_names_stay() {
             Warning::Silent(Silence { doing: Doing::Restart, silent: seconds, limit: seconds }).into(),
             json!({ "doing": "restarting the program", "seconds": 1.235, "limit_seconds": 1.235 }),
         ),
+        (
+            "warning",
+            "adapter",
+            Warning::Adapter { refused: 9, restarts: 1 }.into(),
+            json!({ "refused": 9, "restarts": 1 }),
+        ),
     ];
     for (kind, name, event, data) in cases {
         let mut form = json!({ "event": kind });

@@ -8,7 +8,7 @@ use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
 use coboot_can::Adapter;
-use coboot_can::AdapterError;
+use coboot_can::{AdapterError, Losses};
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
@@ -159,7 +159,83 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
     }
 }
 
-fn many(bus: &mut Bus, nodes: &[u8]) -> Vec<Result<Report, (String, DeviceState)>> {
+/// An adapter that forgets its open bus after START for a while: it refuses all frames, and hears none.
+struct Forgets<A> {
+    bus: A,
+    lasts: Duration,
+    started: Option<Duration>,
+    losses: Losses,
+}
+
+impl<A: Adapter> Forgets<A> {
+    fn new(bus: A, lasts: u64) -> Self {
+        Self { bus, lasts: Duration::from_millis(lasts), started: None, losses: Losses::default() }
+    }
+
+    fn is_closed(&self) -> bool {
+        let open = |started| self.now() > started + Duration::from_millis(100) + self.lasts;
+        self.started
+            .is_some_and(|started| self.now() > started + Duration::from_millis(100) && !open(started))
+    }
+}
+
+impl<A: Adapter> Adapter for Forgets<A> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if self.is_closed() {
+            (self.losses.refused, self.losses.restarts) = (self.losses.refused + 1, 1);
+            return Ok(());
+        }
+        if frame.exactly() == Some(&[0x2F, 0x51, 0x1F, 1, 1, 0, 0, 0]) && self.started.is_none() {
+            self.started = Some(self.now());
+        }
+        self.bus.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let frame = self.bus.receive(timeout)?;
+        self.losses.restarts |= u32::from(self.is_closed());
+        Ok(frame.filter(|_| !self.is_closed()))
+    }
+
+    fn now(&self) -> Duration {
+        self.bus.now()
+    }
+
+    fn losses(&self) -> Losses {
+        self.losses
+    }
+}
+
+/// A silence that may be the adapter's is no verdict on the program, and neither is a watch that it has
+/// interrupted. What the device itself says is one.
+#[test]
+fn a_trial_in_which_the_adapter_restarted_is_no_verdict_on_the_program() {
+    let died = device(&[reset(400, BOOTLOADER)], Some([5, 4, 1]));
+    for (fake, lasts, words) in [
+        (device(&[], None), 60_000, "no verdict on the program of node 5: while it was started and watched, the adapter has restarted once"),
+        (device(&[], None), 300, "no verdict on the program of node 5"),
+        (died, 700, "the program was ended by the independent watchdog"),
+    ] {
+        let mut bus = Forgets::new(fake, lasts);
+        let (result, events) = update(&mut bus, file(), &FlashOptions::default());
+        let error = result.unwrap_err();
+        assert!(text(&error).contains(words), "{lasts}: {}", text(&error));
+        let is_verdict = matches!(error, Error::TrialFailed { .. });
+        assert_eq!(error.number(), if is_verdict { 0x6000_0014 } else { 0x6000_0303 });
+        assert_eq!((bus.bus.count("command 83"), left(&events)), (0, DeviceState::Unreleased));
+        assert!(events.iter().any(|event| event.to_string().starts_with("the adapter has restarted once")));
+    }
+    // The same for two devices in a group, and for the start of a program without a trial.
+    for result in many(&mut Forgets::new(two(), 60_000), &[5, 6]) {
+        let (text, state) = result.unwrap_err();
+        assert!(text.contains("no verdict on the program") && state == DeviceState::Unreleased, "{text}");
+    }
+    let mut bus = Forgets::new(device(&[], None), 60_000);
+    let result = update(&mut bus, file(), &FlashOptions::default().trial_run(false)).0;
+    assert!(matches!(result, Err(Error::NoVerdict { .. })), "{result:?}");
+}
+
+fn many(bus: &mut dyn Adapter, nodes: &[u8]) -> Vec<Result<Report, (String, DeviceState)>> {
     let file = Arc::new(file());
     let job = |node: &u8| Job::new(NodeId::new(*node).unwrap(), file.clone(), FlashOptions::default());
     let jobs: Vec<Job> = nodes.iter().map(job).collect();
