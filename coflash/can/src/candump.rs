@@ -58,8 +58,8 @@ fn parse_time(text: &str) -> Option<Duration> {
     Some(Duration::new(seconds, nanos))
 }
 
-/// `601#4000100000000000`, `12345678#`, `601#R`, `601#R8`; after eight bytes, or `R8`, there may be a data
-/// length code above 8: `601#R8_C` (can-utils, `lib.h`).
+/// `601#4000100000000000`, `601#40.00.10`, `12345678#`, `601#R`, `601#R8`; after eight bytes, or `R8`, there may
+/// be a data length code above 8: `601#R8_C` (can-utils, `lib.h`).
 fn parse_frame(text: &str) -> Result<Option<Frame>, &'static str> {
     const NO_FRAME: &str = "it has no frame, like 601#4000100000000000";
     let (id, data) = text.split_once('#').ok_or(NO_FRAME)?;
@@ -73,13 +73,22 @@ fn parse_frame(text: &str) -> Result<Option<Frame>, &'static str> {
         8 => ExtendedId::new(number & 0x1FFF_FFFF).ok_or(NO_FRAME)?.into(),
         _ => return Err("its identifier has neither 3 nor 8 digits"),
     };
-    let data = data.split('_').next().unwrap_or_default();
-    if let Some(dlc) = data.strip_prefix('R') {
-        let dlc = if dlc.is_empty() { 0 } else { dlc.parse().map_err(|_| NO_FRAME)? };
-        return Frame::new_remote(id, dlc).map(Some).ok_or("a frame has at most 8 bytes");
+    let (data, code) = data.split_once('_').map_or((data, None), |(data, code)| (data, Some(code)));
+    let frame = match data.strip_prefix(['R', 'r']) {
+        Some("") => Frame::new_remote(id, 0),
+        Some(dlc) => Frame::new_remote(id, dlc.parse().map_err(|_| NO_FRAME)?),
+        None => {
+            let bytes = hex_bytes(&data.replace('.', ""));
+            Frame::new(id, &bytes.ok_or("its data are not pairs of hexadecimal digits")?)
+        }
+    };
+    let frame = frame.ok_or("a frame has at most 8 bytes")?;
+    match code.map(hex_number) {
+        Some(code) if frame.dlc() < 8 || !matches!(code, Some(9..=15)) => {
+            Err("its data length code is not one of 9 to F for eight bytes")
+        }
+        _ => Ok(Some(frame)),
     }
-    let bytes = hex_bytes(data).ok_or("its data are not pairs of hexadecimal digits")?;
-    Frame::new(id, &bytes).map(Some).ok_or("a frame has at most 8 bytes")
 }
 
 #[cfg(test)]
@@ -103,8 +112,14 @@ mod tests {
         }
         assert!(Line::parse("(1.5) can0 601#R T").unwrap().unwrap().frame.is_remote_frame());
         // Examples of can-utils' lib.h.
-        for frame in ["123#R8", "333#1122334455667788"] {
-            let line = Line::parse(&format!("(1.5) can0 {frame}_E")).unwrap().unwrap();
+        for (form, frame) in [
+            ("123#R8_E", "123#R8"),
+            ("701#R8_C", "701#R8"),
+            ("333#1122334455667788_9", "333#1122334455667788"),
+            ("5A1#11.2233.44556677.88_f", "5A1#1122334455667788"),
+            ("123#r", "123#R"),
+        ] {
+            let line = Line::parse(&format!("(1.5) can0 {form}")).unwrap().unwrap();
             assert_eq!(line.frame.to_string(), frame);
         }
         for none in
@@ -128,6 +143,9 @@ mod tests {
             "(1.0) can0 +12#",
             "(1.0) can0 601#112233445566778899",
             "(1.0) can0 601#R9",
+            "(1.0) can0 601#R8_8",
+            "(1.0) can0 601#1122_C",
+            "(1.0) can0 601#1122334455667788_10",
             "(1.0) can0 601#\u{e9}",
             "(99999999999999999999.0) can0 601#",
             "(1.9999999999) can0 601#",

@@ -84,6 +84,8 @@ pub(super) enum Fault {
 const OPENING: Duration = Duration::from_secs(5);
 /// How long a frame may wait for room, and how long a driver may take to close.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// After so few attempts the time may have passed while the computer slept.
+const FEW: u32 = 10;
 /// How long the thread waits for a received frame before it checks for a frame to send.
 const TURN: Duration = Duration::from_millis(1);
 /// How often the driver is asked for the state of the bus.
@@ -183,24 +185,24 @@ fn work(
     frames: &SyncSender<Frame>,
     status: &Mutex<DriverStatus>,
 ) -> Result<(), Fault> {
-    // A frame that found no room, and the time of the first attempt.
-    let mut waiting: Option<(Frame, Instant)> = None;
+    // A frame that found no room, the time of the first attempt, and how many there were.
+    let mut waiting: Option<(Frame, Instant, u32)> = None;
     let mut reported = Instant::now();
     loop {
         loop {
-            let (frame, since) = match waiting.take() {
+            let (frame, since, attempts) = match waiting.take() {
                 Some(waiting) => waiting,
                 None => match commands.try_recv() {
-                    Ok(frame) => (frame, Instant::now()),
+                    Ok(frame) => (frame, Instant::now(), 1),
                     Err(TryRecvError::Empty) => break,
                     Err(TryRecvError::Disconnected) => return Ok(()),
                 },
             };
             if driver.send(&frame)? == Sent::Full {
-                if since.elapsed() > PATIENCE {
+                if since.elapsed() > PATIENCE && attempts > FEW {
                     return Err(Fault::Stuck(driver.health()));
                 }
-                waiting = Some((frame, since));
+                waiting = Some((frame, since, attempts + 1));
                 break;
             }
         }

@@ -87,7 +87,7 @@ impl fmt::Display for Losses {
         let Self { refused, lost, restarts } = *self;
         let all = [
             (restarts, format!("has restarted {}, and its bus was opened again", times(restarts))),
-            (refused, format!("has refused {}, and they were sent again", frames(refused))),
+            (refused, format!("has refused {} (sent again)", frames(refused))),
             (lost, format!("has not answered {}", frames(lost))),
         ];
         let all: Vec<String> =

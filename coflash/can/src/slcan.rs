@@ -210,6 +210,12 @@ impl<L: Line> Slcan<L> {
         self.line.flush().map_err(|error| self.lost(error))
     }
 
+    /// Writes text without waiting until the line has sent it. A serial port has one time-out for both ways.
+    fn write_text(&mut self, text: &str) -> Result<(), AdapterError> {
+        let done = self.line.set_timeout(PATIENCE).and_then(|()| self.line.write_all(text.as_bytes()));
+        done.map_err(|error| self.lost(error))
+    }
+
     /// The next message; `None` if the deadline has passed.
     fn message(&mut self, deadline: Instant) -> Result<Option<Message>, AdapterError> {
         loop {

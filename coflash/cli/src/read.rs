@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use coflash_core::advice::Advice;
 use coflash_core::device::value::visible;
 use coflash_core::device::{Dialect, Session};
 use coflash_core::update::dialect::read_locked;
@@ -96,6 +97,9 @@ impl Read {
                 }
                 Err(failure) => return Err(failure),
             }
+        }
+        if session.is_answered_twice().unwrap_or_default() {
+            context.out.warn(Advice::TwoDevices { node: session.node() });
         }
         match values.as_mut_slice() {
             [value] if objects.len() == 1 => {

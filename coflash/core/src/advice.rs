@@ -109,6 +109,9 @@ advice! {
     /// For a node-ID that another device has.
     Occupied { node: NodeId } => "finish the update of the device that is node {node} now, or switch that \
         device off; then [run the command|try] again",
+    /// For a node-ID that two devices have, after "answers, but".
+    TwoDevices { node: NodeId } => "a second device answers as node {node}, too: switch one of them off, or give \
+        one another node-ID[ (coflash lss)|]",
     /// While another tool uses the device.
     NotAlone => "wait until the other tool has finished, or end it; then [run the command|try] again[; \
         coflash flash --not-alone goes on all the same, at the risk that both fail|]",

@@ -11,6 +11,8 @@ use crate::device::error::{Error, Intruder};
 
 /// How long a request of another tool counts.
 const FRESH: Duration = Duration::from_secs(2);
+/// The answers of two devices to one request come within this time: a frame on the slowest bus takes 13 ms.
+const ANSWERS: Duration = Duration::from_millis(30);
 /// How long to wait for a moment without requests of others: the start-up procedure of a CANopen
 /// master (CiA 302-2) is some ten reads, each of which may take a few hundred milliseconds.
 const PEACE: Duration = Duration::from_secs(3);
@@ -90,6 +92,16 @@ impl<'a> Session<'a> {
     /// Whether another tool has written a program or a command to the node since this time.
     pub(crate) fn is_commanded_since(&self, time: Duration) -> bool {
         self.watch().commanded.is_some_and(|at| at >= time)
+    }
+
+    /// Whether a second device has answered a read of this session: listens for the answers that may still
+    /// be on their way.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub fn is_answered_twice(&mut self) -> Result<bool, Error> {
+        self.wait(ANSWERS)?;
+        Ok(self.watch().is_twice)
     }
 
     /// The check of [`ensure_alone`](Self::ensure_alone) without listening any longer.

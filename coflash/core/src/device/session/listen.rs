@@ -1,5 +1,6 @@
 //! What a session receives on the bus, and what it sends besides SDO.
 
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use canopen::nmt::{parse_boot_up, NmtCommand};
@@ -12,6 +13,9 @@ use crate::device::error::{of_gateway, Error};
 
 /// The longest single wait: a cancelled session notices within this time.
 pub(super) const SLICE: Duration = Duration::from_millis(100);
+
+/// A wait that takes so much longer than it may: the computer has slept.
+const SLEEP: Duration = Duration::from_secs(10);
 
 impl Session<'_> {
     /// Waits on the bus. Frames that arrive are ignored.
@@ -134,6 +138,17 @@ impl Session<'_> {
     /// Returns the next frame from the bus. Frames that need an answer of
     /// [`answer_by`](Self::answer_by) are answered here. A gateway reports only boot-up messages.
     pub(super) fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, Error> {
+        let began = self.now();
+        let frame = self.receive_now(began, timeout)?;
+        let beyond = self.now().saturating_sub(began + timeout);
+        if beyond > SLEEP {
+            // The device did not have this time for its answer.
+            self.slept.fetch_add(beyond.as_millis() as u64, Ordering::Relaxed);
+        }
+        Ok(frame)
+    }
+
+    fn receive_now(&mut self, began: Duration, timeout: Duration) -> Result<Option<Frame>, Error> {
         let adapter = match &mut self.access {
             Access::Bus(adapter) => adapter,
             Access::Gateway(gateway) => {
@@ -145,7 +160,6 @@ impl Session<'_> {
                 return Ok(booted.map(|node| Frame::of(CobId::heartbeat(node), &[0])));
             }
         };
-        let began = adapter.now();
         let frame = adapter.receive(timeout)?;
         if let (Some(answer), Some(frame)) = (self.answer, &frame) {
             if let Some(answer) = answer(frame) {

@@ -2,7 +2,7 @@
 //! [`Adapter`] or [`Gateway`].
 
 use std::fmt;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -53,6 +53,8 @@ pub struct Session<'a> {
     cancelled: Option<Arc<AtomicBool>>,
     answer: Option<fn(&Frame) -> Option<Frame>>,
     watch: Arc<Mutex<Watch>>,
+    /// How long the computer has slept, in milliseconds.
+    slept: Arc<AtomicU64>,
     on_silence: Option<&'a dyn Fn(Silence)>,
 }
 
@@ -96,6 +98,7 @@ impl<'a> Session<'a> {
             cancelled: None,
             answer: None,
             watch: Arc::default(),
+            slept: Arc::default(),
             on_silence: None,
         }
     }
@@ -109,7 +112,8 @@ impl<'a> Session<'a> {
             Access::Bus(adapter) => Access::Bus(&mut **adapter),
             Access::Gateway(gateway) => Access::Gateway(&mut **gateway),
         };
-        let (watch, on_silence, sharing) = (self.watch.clone(), self.on_silence, self.sharing);
+        let (watch, slept) = (self.watch.clone(), self.slept.clone());
+        let (on_silence, sharing) = (self.on_silence, self.sharing);
         let takes_blocks = self.takes_blocks;
         let lacks_block_upload = self.lacks_block_upload && node == self.node;
         Session {
@@ -123,6 +127,7 @@ impl<'a> Session<'a> {
             cancelled,
             answer,
             watch,
+            slept,
             on_silence,
         }
     }
@@ -184,13 +189,14 @@ impl<'a> Session<'a> {
         &self.timing
     }
 
-    /// The time on the bus.
+    /// The time on the bus, without the time for which the computer slept.
     #[must_use]
     pub fn now(&self) -> Duration {
-        match &self.access {
+        let now = match &self.access {
             Access::Bus(adapter) => adapter.now(),
             Access::Gateway(gateway) => gateway.now(),
-        }
+        };
+        now.saturating_sub(Duration::from_millis(self.slept.load(Ordering::Relaxed)))
     }
 
     /// Whether the session receives the frames of other nodes. Behind a gateway it does not.

@@ -71,6 +71,10 @@ pub(super) struct Watch {
     pub(super) elsewhere: Option<(Duration, NodeId)>,
     /// The time of the node's last emergency for its software (6000h).
     pub(super) failed: Option<Duration>,
+    /// The reads of the session that have no answer yet.
+    asked: u32,
+    /// Whether more answers to reads came than were asked for: a second device has the node-ID.
+    pub(super) is_twice: bool,
     /// Since when the session hears the bus.
     pub(super) began: Option<Duration>,
 }
@@ -87,6 +91,7 @@ impl Watch {
     pub(super) fn sent(&mut self, frame: &Frame, node: NodeId) {
         if frame.cob_id() == Some(CobId::sdo_request(node)) {
             self.own.sent(frame);
+            self.asked += u32::from(command(frame) == Some(UPLOAD));
         }
     }
 
@@ -122,6 +127,8 @@ impl Watch {
             self.failed = Some(now);
         }
         if id == CobId::sdo_response(node) {
+            self.is_twice |= command(frame) == Some(UPLOAD) && self.asked == 0 && self.foreign.is_none();
+            self.asked -= u32::from(matches!(command(frame), Some(UPLOAD | ABORT)) && self.asked > 0);
             // A request is on the bus before its answer, so an echo that has not arrived before the
             // answer will not arrive. If echoes do arrive, echoes of frames sent after that request
             // may follow.
@@ -147,6 +154,14 @@ pub fn ensure_bus_alone(adapter: &mut dyn Adapter, cancelled: &Arc<AtomicBool>) 
         heard.is_some()
     })?;
     heard.map_or(Ok(()), Err)
+}
+
+/// The command specifier of a transfer's first frame, in requests and answers, and of an abort (CiA 301 clause 7.2.4.3).
+const UPLOAD: u8 = 2;
+const ABORT: u8 = 4;
+
+fn command(frame: &Frame) -> Option<u8> {
+    frame.exactly::<8>().map(|bytes| bytes[0] >> 5)
 }
 
 /// The object of a request; none for a segment, which does not name it.

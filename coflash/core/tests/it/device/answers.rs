@@ -12,7 +12,7 @@ use coflash_core::Error;
 use embedded_can::Frame as _;
 
 use crate::tap::Tap;
-use kit::fake::{Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
+use kit::fake::{Bus, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
 
 const NAME: Address = Address::new(0x1008, 0);
 const TYPE: Address = Address::new(0x1000, 0);
@@ -173,5 +173,20 @@ fn a_refused_object_costs_its_own_cell() {
                 scan(&mut fake, &ScanOptions::default().nodes(vec![node()]), &Arc::default()).unwrap();
             assert_eq!(found[&node()].info, Some(reported), "{at:X?}");
         }
+    }
+}
+
+#[test]
+fn two_devices_with_one_node_id_are_told() {
+    for count in [1, 2] {
+        let mut bus = Bus((0..count).map(|_| Fake::new(BOOTLOADER)).collect());
+        let found = scan(&mut bus, &ScanOptions::default().nodes(vec![node()]), &Arc::default()).unwrap();
+        let but = found[&node()].but.as_ref().map(|but| but.starts_with("a second device answers as node 5"));
+        assert_eq!((but, found[&node()].info.is_none()), ((count == 2).then_some(true), count == 2));
+        let mut session = Session::new(&mut bus, node(), Timing::default());
+        for _ in 0..3 {
+            assert_eq!(session.read_number(Address::new(0x1000, 0)).unwrap(), BOOTLOADER);
+        }
+        assert_eq!(session.is_answered_twice().unwrap(), count == 2);
     }
 }

@@ -159,6 +159,43 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
     }
 }
 
+/// A computer that sleeps for an hour in its nth wait.
+struct Sleeps(Fake, usize);
+
+impl Adapter for Sleeps {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.0.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let frame = self.0.receive(timeout);
+        self.1 = self.1.wrapping_sub(1);
+        self.0.now += Duration::from_secs(if self.1 == 0 { 3600 } else { 0 });
+        frame
+    }
+
+    fn now(&self) -> Duration {
+        self.0.now
+    }
+}
+
+#[test]
+fn an_hour_of_sleep_is_no_silence_of_the_device() {
+    let running = || {
+        let mut fake = device(&[], None);
+        fake.erase_time = Duration::from_secs(5);
+        fake
+    };
+    let mut all = Sleeps(running(), 0);
+    update(&mut all, file(), &FlashOptions::default()).0.unwrap();
+    let waits = all.1.wrapping_neg();
+    assert!(waits > 50, "{waits}");
+    for wait in 1..=waits {
+        let result = update(&mut Sleeps(running(), wait), file(), &FlashOptions::default()).0;
+        assert!(result.is_ok(), "wait {wait} of {waits}: {}", result.unwrap_err());
+    }
+}
+
 /// An adapter that forgets its open bus after START for a while: it refuses all frames, and hears none.
 struct Forgets<A> {
     bus: A,
