@@ -39,11 +39,6 @@ impl Target {
     /// What is wrong with the URL, as a sentence about it.
     pub(super) fn parse(url: &str) -> Result<Self, String> {
         let Some((scheme, rest)) = url.split_once(':') else { return Err(no_scheme(url)) };
-        if scheme != "slcan" && rest.contains("?baud=") {
-            return Err(
-                "only slcan:PORT has a serial line, and with it a speed: leave out ?baud=".to_string()
-            );
-        }
         let word = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_graphic());
         match scheme {
             "socketcand" => {
@@ -138,17 +133,13 @@ fn with_driver(kind: Kind, rest: &str) -> Result<Target, String> {
 /// The text before `?baud=`, and the speed of the serial line in bit/s after it.
 fn with_baud(text: &str) -> Result<(&str, Option<u32>), String> {
     let Some((before, query)) = text.split_once('?') else { return Ok((text, None)) };
-    let baud = query.strip_prefix("baud=").and_then(parse_speed).filter(|baud| BAUDS.contains(baud));
-    match baud {
-        Some(baud) => Ok((before, Some(baud))),
-        None => Err("the speed of its serial line must be like ?baud=57600, and at the end: \
-                     slcan:PORT@500k?baud=57600"
-            .to_string()),
-    }
+    // The speeds of serial lines that exist.
+    let baud =
+        query.strip_prefix("baud=").and_then(parse_speed).filter(|baud| (300..=12_000_000).contains(baud));
+    const FORM: &str =
+        "the speed of its serial line must be like ?baud=57600, and at the end: slcan:PORT@500k?baud=57600";
+    baud.map(|baud| (before, Some(baud))).ok_or(FORM.to_string())
 }
-
-/// The speeds of serial lines that exist, in bit/s.
-const BAUDS: std::ops::RangeInclusive<u32> = 300..=12_000_000;
 
 /// The text before the last `@`, and the bit rate after it.
 fn with_rate(text: &str) -> Result<(&str, Option<u32>), String> {
@@ -276,7 +267,6 @@ mod tests {
             ("slcan:COM7@500k?baud=0", "must be like ?baud=57600"),
             ("slcan:COM7@500k?speed=57600", "must be like ?baud=57600"),
             ("slcan:tcp://host:7@500k?baud=57600", "TCP has no speed"),
-            ("socketcan:can0?baud=57600", "only slcan:PORT has a serial line"),
             ("slcan:/dev/ttyACM0@2M", "must be like 125k, 500k or 1M"),
             ("slcan:/dev/ttyACM0@2000000", "CAN goes up to 1M"),
             ("slcan:/dev/ttyACM0@", "must be like 125k"),

@@ -129,10 +129,10 @@ impl Sending {
         }
     }
 
-    /// The adapter has taken a frame. An empty line may also be the answer to a command, or the begin of words.
-    fn taken(&mut self, is_certain: bool, now: Instant) {
+    /// The adapter has taken a frame, if one is under way.
+    fn taken(&mut self, now: Instant) {
         self.waits = now;
-        if self.under_way.pop_front().is_none() && !(is_certain && self.answers == Answers::Never) {
+        if self.under_way.pop_front().is_none() {
             return;
         }
         self.answers = Answers::Each;
@@ -219,7 +219,7 @@ impl<L: Line> Slcan<L> {
         let end = text.strip_suffix(b"z").or(text.strip_suffix(b"Z"));
         let echo = end.filter(|_| self.echoes).and_then(parse_frame).filter(|echo| self.sent.takes(echo));
         if text.is_empty() || end == Some(b"") || echo.is_some() {
-            self.sending.taken(end.is_some(), now);
+            self.sending.taken(now);
             return None;
         }
         let frame = parse_frame(text);

@@ -71,7 +71,6 @@ pub fn scan(
     }
     let mut found: BTreeMap<NodeId, Found> = BTreeMap::new();
     let mut answered: Vec<NodeId> = Vec::new();
-    let mut answers = Answers::default();
     if options.ask {
         let device_type = Address::new(DEVICE_TYPE, 0);
         let requests =
@@ -85,7 +84,6 @@ pub fn scan(
             let mut silent: Vec<NodeId> = nodes.to_vec();
             listen(adapter, options.timing.sdo.min(AT_ONCE_LIMIT), cancelled, &mut |frame| {
                 note_state(&mut found, frame);
-                answers.count(frame);
                 let answering = silent.iter().position(|node| is_answer(frame, *node));
                 answered.extend(answering.map(|at| silent.remove(at)));
                 silent.is_empty()
@@ -94,45 +92,22 @@ pub fn scan(
     }
     listen(adapter, options.listen, cancelled, &mut |frame| {
         note_state(&mut found, frame);
-        answers.count(frame);
         false
     })?;
     for node in answered {
-        if answers.0.get(&node).is_some_and(|count| *count > 1) {
-            // What they say would be a mixture of both.
-            found.entry(node).or_default().but = Some(format!("{}", Advice::TwoDevices { node }));
-            continue;
-        }
         let mut session = Session::new(adapter, node, options.timing);
         session.cancel_by(cancelled.clone());
         let reported = info(&mut session);
         let found = found.entry(node).or_default();
         match reported {
+            // What it is told is a mixture of both.
+            _ if session.is_answered_twice()? => found.but = Some(Advice::TwoDevices { node }.to_string()),
             Ok(reported) => found.info = Some(reported),
             Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
             Err(error) => found.but = Some(but(&error)),
         }
     }
     Ok(found)
-}
-
-/// The answers of each node to the question for its device type, less the requests of other tools for it.
-#[derive(Default)]
-struct Answers(BTreeMap<NodeId, i32>);
-
-impl Answers {
-    fn count(&mut self, frame: &Frame) {
-        let (Some(id), Some([command, 0x00, 0x10, 0, ..])) = (frame.cob_id(), frame.exactly::<8>()) else {
-            return;
-        };
-        let Some(node) = NodeId::new((id.get() & 0x7F) as u8) else { return };
-        // The first three bits of an answer to an upload request, and of such a request, are 2 (CiA 301 7.2.4.3.5).
-        match id.get() & 0x780 {
-            0x580 if command >> 5 == 2 => *self.0.entry(node).or_default() += 1,
-            0x600 if command >> 5 == 2 => *self.0.entry(node).or_default() -= 1,
-            _ => {}
-        }
-    }
 }
 
 /// On a working bus, no node takes longer for the first answer.

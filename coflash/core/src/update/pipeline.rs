@@ -59,7 +59,8 @@ pub(super) fn flash_knowing(
     let (result, node, transfers) = reporting_silence(session, on_event, |session, on_event| {
         let before = session.losses();
         let mut update = RunningUpdate::new(session.node(), *options, known, on_event);
-        let result = procedure(session, file, &mut update).map_err(|error| update.judged(session, error));
+        let result = procedure(session, file, &mut update);
+        let result = update.verdict(session, result);
         let left = match &result {
             Ok(_) => DeviceAfterUpdate { state: update.known.state, answer: DeviceAnswer::NotAsked },
             Err(error) => state_after(session, error, &update, options.program, file.crcs()),
@@ -141,7 +142,6 @@ fn procedure(
             let starts = session.now();
             let running = procedure.start(session, update.original, options.program)?;
             watch::watch(session, starts, time)?;
-            update.verdict(session)?;
             update.report(Phase::Started(running).into());
             Some(running)
         }

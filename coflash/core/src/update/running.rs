@@ -132,30 +132,21 @@ impl<'t> RunningUpdate<'t> {
         }
     }
 
-    /// What has not gone through the adapter since a program was started.
-    fn lost(&self, session: &Session<'_>) -> Losses {
-        self.losses.map_or(Losses::default(), |before| session.losses().since(before))
-    }
-
-    /// The result of the start of a program: an adapter that has restarted may have lost its end.
+    /// The result of what has started a program: no verdict on it are a silence in which the adapter failed,
+    /// and a watch that a restart of the adapter has interrupted.
     ///
     /// # Errors
-    /// [`Error::NoVerdict`].
-    pub(super) fn verdict(&self, session: &Session<'_>) -> Result<(), Error> {
-        match self.lost(session) {
-            losses if losses.restarts > 0 => Err(Error::NoVerdict { node: session.node(), losses }),
-            _ => Ok(()),
+    /// [`Error::NoVerdict`], and that of `result`.
+    pub(super) fn verdict<R>(&self, session: &Session<'_>, result: Result<R, Error>) -> Result<R, Error> {
+        let losses = self.losses.map_or(Losses::default(), |before| session.losses().since(before));
+        let is_open = match &result {
+            Ok(_) => losses.restarts > 0,
+            Err(error) => losses != Losses::default() && error.is_silence(),
+        };
+        if is_open {
+            return Err(Error::NoVerdict { node: session.node(), losses });
         }
-    }
-
-    /// The same error; silence that may be the adapter's is no verdict on the program.
-    pub(super) fn judged(&self, session: &Session<'_>, error: Error) -> Error {
-        match self.lost(session) {
-            losses if losses != Losses::default() && error.is_silence() => {
-                Error::NoVerdict { node: session.node(), losses }
-            }
-            _ => error,
-        }
+        result
     }
 
     /// Records that the erase is about to start; `before` is the value of 1F56h, if it was read.

@@ -26,7 +26,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
     let back = call_back(session).map_err(failed);
     right?;
     back?;
-    update.verdict(session)?;
+    update.verdict(session, Ok(()))?;
     update.report(Phase::TrialPassed(running).into());
     Ok(())
 }
