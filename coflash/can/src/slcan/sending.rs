@@ -28,8 +28,9 @@ const CLOSED: Duration = Duration::from_millis(100);
 const STUCK: Duration = Duration::from_secs(1);
 /// The bits of a frame with an identifier of 11 bits and 8 bytes, without stuff bits (ISO 11898-1).
 const FRAME_BITS: u64 = 111;
-/// The frames that a queue without answers is taken to have.
+/// The frames that a queue without answers is taken to have; a shorter one than this gets one at a time.
 const UNKNOWN_QUEUE: u32 = 8;
+const SHORT_QUEUE: u32 = 4;
 
 /// Whether the adapter answers frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,8 +92,14 @@ impl Sending {
     pub(super) fn opened(&mut self, bit_rate: Option<u32>, answers: bool) {
         self.shortest = bit_rate.map_or(Duration::ZERO, |rate| Duration::from_secs(FRAME_BITS) / rate.max(1));
         self.frame_time = self.shortest;
-        self.answers = if answers { Answers::Unknown } else { Answers::Never };
-        self.capacity = (!answers).then_some(UNKNOWN_QUEUE);
+        self.answers = Answers::Unknown;
+        if !answers {
+            self.set_silent();
+        }
+    }
+
+    fn set_silent(&mut self) {
+        (self.answers, self.capacity) = (Answers::Never, Some(UNKNOWN_QUEUE));
     }
 
     /// When something is to be done about what was sent, at the latest.
@@ -111,13 +118,14 @@ impl Sending {
         if under_way >= MOST_UNDER_WAY || !self.refused.is_empty() || is_blind {
             return None;
         }
-        let before = self.frame_time * self.capacity.map_or(0, |capacity| capacity.saturating_sub(1));
-        let queued = self.capacity.and_then(|_| self.empty.checked_sub(before)).unwrap_or(self.waits);
-        match self.capacity {
-            Some(_) if under_way > 0 => Some(queued.max(self.waits + LEAD.max(self.frame_time))),
-            None if under_way >= AT_ONCE => Some(self.waits + LEAD),
-            _ => Some(queued),
-        }
+        let Some(capacity) = self.capacity else {
+            return Some(if under_way < AT_ONCE { self.waits } else { self.waits + LEAD });
+        };
+        // A quarter of a longer queue stays free, for what the estimate does not know.
+        let before = self.frame_time * (capacity - capacity / 4 - 1);
+        let queued = self.empty.checked_sub(before).unwrap_or(self.waits);
+        let is_short = capacity < SHORT_QUEUE && under_way > 0;
+        Some(if is_short { queued.max(self.waits + LEAD.max(self.frame_time)) } else { queued })
     }
 
     /// A frame is sent now.
@@ -153,11 +161,12 @@ impl Sending {
         self.refused.push_back(frame);
         if self.refusal.is_none() && self.capacity.is_some() {
             // The frames of others, and stuff bits, take time, too.
-            self.frame_time = (self.frame_time + self.frame_time / 16).min(4 * self.shortest);
+            self.frame_time = (self.frame_time + self.frame_time / 8).min(4 * self.shortest);
         }
         let left = self.empty.saturating_duration_since(now).as_nanos();
         let queued = (left / self.frame_time.as_nanos().max(1)) as u32;
-        self.capacity.get_or_insert(queued.saturating_sub(1 + self.under_way.len() as u32).max(1));
+        let queued = queued.saturating_sub(1 + self.under_way.len() as u32).max(1);
+        self.capacity = self.capacity.max(Some(queued));
         self.is_full(now);
     }
 
@@ -175,7 +184,7 @@ impl Sending {
     /// What was sent is not answered any more.
     fn give_up(&mut self) {
         match self.answers {
-            Answers::Unknown => self.answers = Answers::Never,
+            Answers::Unknown => self.set_silent(),
             _ => self.losses.lost = self.losses.lost.saturating_add(self.under_way.len() as u32),
         }
         self.under_way.clear();
