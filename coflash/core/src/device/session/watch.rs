@@ -71,8 +71,8 @@ pub(super) struct Watch {
     pub(super) elsewhere: Option<(Duration, NodeId)>,
     /// The time of the node's last emergency for its software (6000h).
     pub(super) failed: Option<Duration>,
-    /// The reads of the session that have no answer yet.
-    asked: u32,
+    /// The object that the session has asked for last, and how many answers are to come.
+    asked: ([u8; 3], u32),
     /// Whether more answers to reads came than were asked for: a second device has the node-ID.
     pub(super) is_twice: bool,
     /// Since when the session hears the bus.
@@ -91,7 +91,10 @@ impl Watch {
     pub(super) fn sent(&mut self, frame: &Frame, node: NodeId) {
         if frame.cob_id() == Some(CobId::sdo_request(node)) {
             self.own.sent(frame);
-            self.asked += u32::from(command(frame) == Some(UPLOAD));
+            if let Some(&[_, a, b, c, ..]) = frame.exactly::<8>().filter(|bytes| asks(bytes[0])) {
+                let (object, more) = self.asked;
+                self.asked = ([a, b, c], if object == [a, b, c] { more + 1 } else { 1 });
+            }
         }
     }
 
@@ -101,6 +104,17 @@ impl Watch {
             self.booted = Some(now);
         } else {
             self.elsewhere = Some((now, booted));
+        }
+    }
+
+    /// Counts an answer to the read of an object: a value, the begin of a transfer, or an abort. What is in
+    /// the segments of a transfer is none, as it does not begin with the object.
+    fn count_answer(&mut self, frame: &Frame) {
+        let (object, more) = self.asked;
+        match frame.exactly::<8>().filter(|bytes| bytes[1..4] == object).map(|bytes| bytes[0] >> 5) {
+            Some(2 | 4 | 6) if more > 0 => self.asked.1 -= 1,
+            Some(2 | 6) => self.is_twice |= self.foreign.is_none(),
+            _ => {}
         }
     }
 
@@ -127,8 +141,7 @@ impl Watch {
             self.failed = Some(now);
         }
         if id == CobId::sdo_response(node) {
-            self.is_twice |= command(frame) == Some(UPLOAD) && self.asked == 0 && self.foreign.is_none();
-            self.asked -= u32::from(matches!(command(frame), Some(UPLOAD | ABORT)) && self.asked > 0);
+            self.count_answer(frame);
             // A request is on the bus before its answer, so an echo that has not arrived before the
             // answer will not arrive. If echoes do arrive, echoes of frames sent after that request
             // may follow.
@@ -156,12 +169,9 @@ pub fn ensure_bus_alone(adapter: &mut dyn Adapter, cancelled: &Arc<AtomicBool>) 
     heard.map_or(Ok(()), Err)
 }
 
-/// The command specifier of a transfer's first frame, in requests and answers, and of an abort (CiA 301 clause 7.2.4.3).
-const UPLOAD: u8 = 2;
-const ABORT: u8 = 4;
-
-fn command(frame: &Frame) -> Option<u8> {
-    frame.exactly::<8>().map(|bytes| bytes[0] >> 5)
+/// Whether a request with this command begins to read an object, in segments or as blocks (CiA 301 clause 7.2.4.3).
+const fn asks(command: u8) -> bool {
+    command >> 5 == 2 || command & 0xE3 == 0xA0
 }
 
 /// The object of a request; none for a segment, which does not name it.
