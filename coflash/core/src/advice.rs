@@ -109,7 +109,7 @@ advice! {
     /// For a node-ID that another device has.
     Occupied { node: NodeId } => "finish the update of the device that is node {node} now, or switch that \
         device off; then [run the command|try] again",
-    /// For a node-ID that two devices have, after "answers, but".
+    /// For a node-ID that two devices have.
     TwoDevices { node: NodeId } => "a second device answers as node {node}, too: switch one of them off, or give \
         one another node-ID[ (coflash lss)|]",
     /// While another tool uses the device.

@@ -580,33 +580,31 @@ fn sub_blocks(size: usize, rate: u32, latency: u64, baud: u32) -> (Vec<String>, 
     (device.queue.unwrap().bus, time, refused)
 }
 
-/// What fits into the queue while its answer is on the way keeps the bus busy.
+/// What fits into the queue while an answer is on the way (USB takes 1 ms, some converters 16 ms) keeps the bus busy.
 #[test]
 fn a_refused_frame_is_sent_again_in_its_order() {
     let sent: Vec<String> = (0..8 * 127).map(|segment| format!("t6058{segment:04X}020304050607")).collect();
-    for (rate, latency, baud, sizes) in [
-        (125_000, 100, 12_000_000, &[3, 16, 64][..]),
-        (500_000, 100, 12_000_000, &[3, 16, 64]),
-        (1_000_000, 100, 12_000_000, &[3, 16, 64]),
-        // USB, and converters from USB with their 16 ms.
-        (125_000, 1_000, 12_000_000, &[3, 16, 64]),
-        (500_000, 1_000, 12_000_000, &[16, 64]),
-        (125_000, 16_000, 3_000_000, &[64]),
-        (125_000, 16_000, 1_000_000, &[64]),
-        (125_000, 1_000, 1_000_000, &[3, 16, 64]),
-        (125_000, 1_000, 115_200, &[3, 16, 64]),
-        (125_000, 1_000, 57_600, &[3, 16, 64]),
+    for (rate, latency, baud, shortest) in [
+        (125_000, 100, 12_000_000, 3),
+        (1_000_000, 100, 12_000_000, 3),
+        (125_000, 1_000, 12_000_000, 3),
+        (500_000, 1_000, 12_000_000, 16),
+        (125_000, 16_000, 3_000_000, 64),
+        (125_000, 1_000, 1_000_000, 3),
+        (125_000, 1_000, 115_200, 3),
+        (125_000, 1_000, 57_600, 3),
     ] {
         let (all, free, none) = sub_blocks(10_000, rate, latency, baud);
         assert_eq!((&all, none), (&sent, 0));
-        for size in sizes {
-            let at = format!("{size} frames, {rate} bit/s, {latency} us, {baud} baud");
-            let (mut bus, time, refused) = sub_blocks(*size, rate, latency, baud);
-            assert!(time.as_secs_f64() <= 1.3 * free.as_secs_f64(), "{at}: {time:?}, not {free:?}");
-            assert!(refused <= sent.len() as u32 / 2, "{at}: {refused} refused");
+        for size in [3, 16, 64].into_iter().filter(|size| *size >= shortest) {
+            let (mut bus, time, refused) = sub_blocks(size, rate, latency, baud);
             // A frame that was on its way when the one before was refused.
             let late = bus.iter().zip(&sent).filter(|(there, sent)| there != sent).count();
-            assert!(late <= 30, "{at}: {late} late");
+            let at = format!(
+                "{size} frames, {rate} bit/s, {latency} us, {baud} baud: {refused} refused, {late} late"
+            );
+            assert!(time.as_secs_f64() <= 1.3 * free.as_secs_f64(), "{at}: {time:?}, not {free:?}");
+            assert!(refused <= sent.len() as u32 / 20 && late <= 30, "{at}");
             bus.sort();
             assert_eq!(bus, sent, "{at}");
         }
@@ -630,10 +628,7 @@ fn an_adapter_that_has_restarted_is_opened_again() {
         assert_eq!(bus.losses().restarts, 1, "{text:?}");
         assert_eq!(bus.losses().refused > 0, text.is_empty(), "{text:?}");
         let advice = bus.health().unwrap().advice().unwrap();
-        assert!(
-            advice.starts_with("the adapter has restarted once, and its bus was opened again"),
-            "{advice}"
-        );
+        assert!(advice.contains("restarted once, and its bus was opened again"), "{advice}");
         drop(bus);
         let again = &device.lines[lines..];
         assert!(again.iter().any(|line| line == "S4"), "{again:?}");

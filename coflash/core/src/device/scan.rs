@@ -15,7 +15,6 @@ use super::info::{info, DeviceInfo};
 use super::listen::listen;
 use super::session::{ensure_bus_alone, Session};
 use super::timing::Timing;
-use crate::advice::Advice;
 use coboot_can::Adapter;
 
 /// A node that answered or was heard.
@@ -101,7 +100,9 @@ pub fn scan(
         let found = found.entry(node).or_default();
         match reported {
             // What it is told is a mixture of both.
-            _ if session.is_answered_twice()? => found.but = Some(Advice::TwoDevices { node }.to_string()),
+            _ if session.is_answered_twice()? => {
+                found.but = Some("so does a second device with this node-ID: switch one off".into())
+            }
             Ok(reported) => found.info = Some(reported),
             Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
             Err(error) => found.but = Some(but(&error)),

@@ -74,7 +74,8 @@ impl Procedure for Renew {
         if let Some(running) = running {
             update.report(Phase::Started(running).into());
         }
-        update.known.state = DeviceState::Untouched;
+        // The new bootloader has answered, which is a verdict.
+        (update.known.state, update.losses) = (DeviceState::Untouched, None);
         let Renewal { repeats, transfer: took, .. } = renewal;
         Ok(Downloaded { repeats, took, released: None, renewal: Some(Renewal { running, ..renewal }) })
     }

@@ -181,7 +181,7 @@ fn two_devices_with_one_node_id_are_told() {
     for count in [1, 2] {
         let mut bus = Bus((0..count).map(|_| Fake::new(BOOTLOADER)).collect());
         let found = scan(&mut bus, &ScanOptions::default().nodes(vec![node()]), &Arc::default()).unwrap();
-        let but = found[&node()].but.as_ref().map(|but| but.starts_with("a second device answers as node 5"));
+        let but = found[&node()].but.as_ref().map(|but| but.starts_with("so does a second device"));
         assert_eq!((but, found[&node()].info.is_none()), ((count == 2).then_some(true), count == 2));
         let mut session = Session::new(&mut bus, node(), Timing::default());
         for _ in 0..3 {

@@ -210,9 +210,9 @@ impl<A: Adapter> Forgets<A> {
     }
 
     fn is_closed(&self) -> bool {
-        let open = |started| self.now() > started + Duration::from_millis(100) + self.lasts;
-        self.started
-            .is_some_and(|started| self.now() > started + Duration::from_millis(100) && !open(started))
+        let since =
+            self.started.map(|started| self.now().saturating_sub(started + Duration::from_millis(100)));
+        since.is_some_and(|since| !since.is_zero() && since < self.lasts)
     }
 }
 
