@@ -50,13 +50,13 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::{Renewal, Sealed, SealedMemory, Step};
+    use boot_core::decision;
     use boot_core::store::NodeParameters;
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
     use bsp::{line, pac, CanPort, IDENTITY, LAYOUT};
     use core::mem::MaybeUninit;
-    use core::ops::RangeInclusive;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use product::{CrystalFailure, PRODUCT};
@@ -130,8 +130,12 @@ mod app {
         const LSS_IDENTIFY: bool = LSS.identify;
         const LSS_STORE: bool = LSS.store;
         const DETECTS_BIT_RATE: bool = PRODUCT.node.auto_bit_rate;
-        const NODE_IDS: RangeInclusive<u8> = PRODUCT.node.ids;
+        const DECISION: &'static decision::Policy = &PRODUCT.decision();
         const PROGRAM_START: ProgramStart = product::PROGRAM_START;
+
+        fn entry_strap(_: bool) -> bool {
+            bsp::entry_strap(bsp::SYSCLK)
+        }
     }
 
     #[shared]

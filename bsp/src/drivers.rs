@@ -104,24 +104,24 @@ pub fn clocks(rcc: pac::RCC) -> Option<Rcc> {
 }
 
 /// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader; always false on a board
-/// without a strap. Leaves its port in the reset state.
+/// without a strap. `core` is the clock of the core in Hz, at most. Leaves its port as it was.
 #[must_use]
-pub fn entry_strap() -> bool {
+pub fn entry_strap(core: u32) -> bool {
     let Some(Strap { port, pin, pressed, pull }) = ENTRY_STRAP else { return false };
     let is_pressed = || (0..Strap::SAMPLES).all(|_| (inputs(port) & 1 << pin != 0) == pressed);
     match pull {
         Pull::None => is_pressed(),
-        Pull::Up => pulled(port, pin, 0b01, is_pressed),
-        Pull::Down => pulled(port, pin, 0b10, is_pressed),
+        Pull::Up => pulled(port, pin, 0b01, core, is_pressed),
+        Pull::Down => pulled(port, pin, 0b10, core, is_pressed),
     }
 }
 
 /// Runs a function while a resistor of the chip is on at a pin, after the time to charge the wire.
-fn pulled<T>(port: char, pin: u8, resistor: u32, action: impl FnOnce() -> T) -> T {
-    /// 40 kΩ and 1 nF are 40 µs; this is five times that, in cycles of the 16 MHz after a reset.
-    const SETTLED: u32 = 3_200;
+fn pulled<T>(port: char, pin: u8, resistor: u32, core: u32, action: impl FnOnce() -> T) -> T {
+    /// 40 kΩ and 1 nF are 40 µs; this is five times that: its part of a second.
+    const SETTLED: u32 = 5_000;
     let pupdr = (0x4002_000C + 0x400 * (port as u32 - 'A' as u32)) as *mut u32;
-    // SAFETY: only the boot stage runs; all that changes here is restored.
+    // SAFETY: nothing that interrupts this uses the register; all that changes here is restored.
     let rcc = unsafe { pac::RCC::steal() };
     let clocks = rcc.ahb1enr();
     let before = clocks.read().bits();
@@ -134,7 +134,7 @@ fn pulled<T>(port: char, pin: u8, resistor: u32, action: impl FnOnce() -> T) -> 
     let at = 2 * u32::from(pin);
     // SAFETY: as above; the other pins keep their resistors.
     unsafe { pupdr.write_volatile(resistors & !(0b11 << at) | resistor << at) };
-    cortex_m::asm::delay(SETTLED);
+    cortex_m::asm::delay(core / SETTLED);
     let done = action();
     // SAFETY: the original value.
     unsafe { pupdr.write_volatile(resistors) };
@@ -144,7 +144,7 @@ fn pulled<T>(port: char, pin: u8, resistor: u32, action: impl FnOnce() -> T) -> 
 }
 
 /// The levels of the 16 pins of a port, `'A'` and on; all low for a port that the chip does not
-/// have. It is for the boot stage: no pin was set up since the reset, and the port keeps its state.
+/// have. No pin is set up for it, and the port keeps its state.
 /// The board must have the pull-up and pull-down resistors that the pins need.
 #[must_use]
 pub fn inputs(port: char) -> u16 {
@@ -155,7 +155,7 @@ pub fn inputs(port: char) -> u16 {
     // The addresses of the ports follow one another (RM0090 and RM0390, register boundary
     // addresses), and their clock bits are in the same order (RCC_AHB1ENR).
     let idr = (0x4002_0010 + 0x400 * port) as *const u32;
-    // SAFETY: only the boot stage runs; the changed clock is restored.
+    // SAFETY: nothing that interrupts this uses the register; the changed clock is restored.
     let rcc = unsafe { pac::RCC::steal() };
     let clocks = rcc.ahb1enr();
     let before = clocks.read().bits();

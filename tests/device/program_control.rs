@@ -469,10 +469,10 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
     for (damage, reason) in [(region.base + 0x400, 9), (region.base, 10)] {
         let mut bench = running_board(firmware::APP_V1);
         bench.call_back();
-        // It came back on request.
-        let state = [1, 2, 3, 4].map(|sub| read(&mut bench, 0x2007, sub));
+        // It came back on request; a reset would start it.
+        let state = [1, 11, 3, 4, 2].map(|sub| read(&mut bench, 0x2007, sub));
         let number = firmware::board().staging.map_or(0, |_| renewal::number());
-        assert_eq!(state, [u32::from(number), 0, 3, 0]);
+        assert_eq!(state, [u32::from(number), 0, 3, 0, 255]);
         assert_ne!(read(&mut bench, PROGRAM_ID, 1), 0);
         bench.machine().poke(damage, &[0, 0, 0, 0]).unwrap();
         bench.session().command(1, ProgramControl::Start).unwrap();

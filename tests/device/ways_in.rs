@@ -1,7 +1,7 @@
 //! Ways into a bootloader without an entry strap, in a product that has them: two resets by the NRST pin, and
 //! the loader in the chip's ROM.
 
-use canopen::program::{DEVICE_STATE, STATE_CRASH_RESETS, STATE_REASON};
+use canopen::program::{DEVICE_STATE, STATE_CRASH_RESETS, STATE_LAST_REASON};
 use canopen::{AbortCode, Address};
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
@@ -10,7 +10,7 @@ use emulator::silicon::TYPICAL;
 use emulator::time::Span;
 use shared_abi::geometry::Line;
 
-/// 2007h/2: two resets (docs/protocol.md).
+/// 2007h/11: two resets (docs/protocol.md).
 const TWO_RESETS: u8 = 13;
 
 /// A board with a confirmed program that runs.
@@ -24,11 +24,11 @@ fn reset(bench: &mut Bench) {
     bench.machine().reset_pin();
 }
 
-/// 2007h/2 and 2007h/4.
+/// 2007h/11 and 2007h/4.
 fn state(bench: &mut Bench) -> (u8, u8) {
     let mut session = bench.session();
     let mut read = |sub| session.read(Address::new(DEVICE_STATE, sub)).unwrap()[0];
-    (read(STATE_REASON), read(STATE_CRASH_RESETS))
+    (read(STATE_LAST_REASON), read(STATE_CRASH_RESETS))
 }
 
 /// After a reset by the pin the program starts half a second later, and nothing is on the bus before. A second

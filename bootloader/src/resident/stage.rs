@@ -136,7 +136,7 @@ fn take(rcc: &pac::RCC, cell: &mut Cell) -> Woken {
         cause,
         request,
         is_marked,
-        strap: bsp::entry_strap(),
+        strap: bsp::entry_strap(bsp::clock::HSI),
         ended: if product::RENEWS { ended(cause) } else { None },
         // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
         // Nothing has written it since the program started.

@@ -20,7 +20,7 @@ use super::run::{Devices, Order};
 use coboot_can::Link;
 use coflash_core::device::info::program_info;
 use coflash_core::device::lock::Lock;
-use coflash_core::device::state::{reason, source, supply};
+use coflash_core::device::state::{source, supply};
 use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
 use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
 use coflash_core::update::{Event, FlashOptions, Installed, Known, Payload, Report};
@@ -249,7 +249,8 @@ fn attributes(target: &Target, device: &Device, info: &DeviceInfo) -> Vec<(Strin
         all.extend(number.map(|number| (key.to_string(), format!("{number:08X}h"))));
     }
     if let Some(state) = info.state {
-        all.push(("stays".to_string(), reason(state.reason)));
+        all.extend(state.stays().map(|why| ("stays".to_string(), why)));
+        all.extend(state.last_reset().map(|words| ("last_reset".to_string(), words)));
         all.extend(state.ended_by().map(|by| ("program_ended_by".to_string(), source(by).to_string())));
         all.push(("crash_resets".to_string(), state.crash_resets.to_string()));
         all.extend(state.option_bytes.map(|options| ("option_bytes".to_string(), options.to_string())));

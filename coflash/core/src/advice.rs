@@ -94,6 +94,9 @@ advice! {
     /// For an object that only the bootloader has.
     CallBootloader => "the bootloader has this object, and its application need not have it: [coflash \
         enter|More … at the device] calls the bootloader; one without support for sealed images has none",
+    /// For a release while the program runs.
+    EnterFirst => "its program runs, and only the bootloader changes the release: call the bootloader [(coflash \
+        enter)|(More … at the device)], [run the command|try] again, and start the program then[ (coflash start)|]",
     /// For an option that the dialect does not have.
     OtherDialect => "[leave out this option, or name another dialect with --dialect|the device cannot do this]",
     /// For a locked device.
@@ -441,6 +444,27 @@ advice! {
         Start the program, which tries it, and Release for autostart]",
     /// For a program that waits after a call.
     StartIt => "[coflash start|Start the program, in More … at the device,] starts it again",
+    /// For a device whose next reset starts its program.
+    StartNow => "[coflash start|Start the program, in More … at the device,] starts the program now",
+    /// For an entry strap that is set.
+    ReleaseStrap => "release the entry strap (a button or a jumper of the board), then reset the device",
+    /// For a program that has crashed too often.
+    CrashLoop => "find out why the program ends; [coflash start|Start the program, in More … at the device,] \
+        starts it again and counts anew",
+    /// For a product without autostart.
+    StartByCommand => "[coflash start|Start the program, in More … at the device,] starts the program; this \
+        product waits for that after each reset",
+    /// For a bootloader that had a fault.
+    BootloaderFault => "[coflash start|Start the program, in More … at the device,] starts the program now; if \
+        the fault happens again, [send a report (coflash more report) to|ask] the maker of the bootloader",
+    /// For a device that was asked in its rescue window.
+    AskedInWindow => "[coflash start|Start the program, in More … at the device,] starts the program now; let \
+        masters wait until its boot-up before they ask the device",
+    /// For a trial of a bootloader.
+    RenewalOpen => "look at the line \"bootloader\": on trial it is confirmed by [coflash flash|an update] with \
+        its file; after a trial [coflash start|Start the program, in More … at the device,] starts the program",
+    /// For a device that compacts its stored values.
+    Compacts => "wait for a second: the program starts by itself",
     /// For a bootloader on trial.
     ConfirmIt => "[coflash flash|an update] with its file confirms it",
 }

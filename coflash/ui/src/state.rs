@@ -119,8 +119,10 @@ pub(super) struct Device {
     pub(super) dialect: Option<&'static str>,
     /// What it reports about sealed images: whether it is sealed, root keys, counters and epoch.
     pub(super) security: Option<Security>,
-    /// Why it stays in its bootloader, in words (2007h).
+    /// Why it stays in its bootloader now, and why it did at its last reset, in words (2007h); what to do.
     pub(super) state: Option<String>,
+    pub(super) last_reset: Option<String>,
+    pub(super) advice: Option<String>,
     /// Its supply, in words (2007h).
     pub(super) supply: Option<&'static str>,
     /// Its option bytes in words, and what is wrong with them.
@@ -351,6 +353,8 @@ impl Device {
             dialect: info.dialect.map(|dialect| dialect.name()),
             security: info.security.clone(),
             state: info.state.map(|state| state.to_string()),
+            last_reset: info.state.and_then(|state| state.last_reset()),
+            advice: info.state.and_then(|state| state.advice()).map(|advice| advice::on_page(&advice)),
             supply: info.state.and_then(|state| supply(state.supply)),
             option_bytes: option_bytes.map(|bytes| bytes.to_string()),
             warnings: option_bytes.map_or(Vec::new(), |bytes| bytes.warnings()),
@@ -399,6 +403,9 @@ impl Program {
         }
         if let Some(version) = info.release() {
             words += &format!(", {version}");
+        }
+        if let Some(released) = info.released {
+            words += if released { ", released" } else { ", not released" };
         }
         Self { number: info.number, crc: info.crc, words }
     }

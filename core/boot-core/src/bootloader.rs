@@ -13,8 +13,9 @@ use canopen::program::{
     control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DATE_ENTRIES, DEVICE_STATE,
     ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_DATE, PROGRAM_ID,
     PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES,
-    ROM_LOADER_SIGNATURE, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES,
-    STATE_PROGRAM_START, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
+    ROM_LOADER_SIGNATURE, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_LAST_REASON,
+    STATE_OPTION_BYTES, STATE_PROGRAM_START, STATE_REASON, STATE_RELEASED, STATE_RENEWAL, STATE_STARTS,
+    STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -30,6 +31,7 @@ use {canopen::program::ACCESS, seal::access::right};
 use crate::choices::Has;
 pub use crate::choices::{Choices, Everything, Extras, PasswordObject};
 use crate::control::{Downloader, Policy, Sealed, Step};
+use crate::decision::{next_stay, Outlook};
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
@@ -127,7 +129,7 @@ pub struct Config {
 pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices = Everything> {
     config: &'static Config,
     serial_number: u32,
-    /// 2007h/1 to 5.
+    /// 2007h/1, 11, 3, 4 and 5.
     state: [u8; 5],
     /// Node-ID and bit rate as stored.
     node: NodeParameters,
@@ -279,10 +281,24 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
 
     /// A value of 2007h that is a byte.
     fn state(&self, sub: u8) -> u8 {
-        if sub == STATE_SUPPLY {
-            return self.flash.supply() as u8;
-        }
-        self.state.get(usize::from(sub).wrapping_sub(1)).copied().unwrap_or(0)
+        let place = match sub {
+            STATE_SUPPLY => return self.flash.supply() as u8,
+            STATE_REASON => return self.next_stay(),
+            STATE_LAST_REASON => STATE_REASON,
+            sub => sub,
+        };
+        self.state.get(usize::from(place).wrapping_sub(1)).copied().unwrap_or(0)
+    }
+
+    /// 2007h/2: what the boot stage would choose after a power-on now.
+    fn next_stay(&self) -> u8 {
+        let [_, reason, _, crash_resets, _] = self.state;
+        let outlook = Outlook {
+            strap: C::entry_strap(reason == Reason::Strap as u8),
+            crash_resets: crash_resets.into(),
+            node_id: self.node.id_or_none(),
+        };
+        next_stay(outlook, C::DECISION, &self.download).map_or(STATE_STARTS, |reason| reason as u8)
     }
 
     /// Whether [`Bootloader::step`] has work to do.
@@ -360,7 +376,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
-        if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
+        // Without a node-ID there is no SDO server.
+        let Some(id) = self.id else { return Err(AbortCode::NO_DATA) };
+        if let Some(read) = self.emcy.read(id, at, buf) {
             return read;
         }
         if C::READS_BACK && at == Address::new(SOFTWARE_VERSION, 0) {
@@ -378,6 +396,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             PROGRAM_PARTIAL if C::RESUMES => return put(buf, &self.download.partial(at.sub)),
             DEVICE_STATE if at.sub == STATE_PROGRAM_START => const { C::PROGRAM_START.to_word() },
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
+            DEVICE_STATE if at.sub == STATE_RELEASED => self.download.released(),
             DEVICE_STATE if C::RENEWS && at.sub == STATE_VERSIONS => {
                 return put(buf, &self.download.versions());
             }
@@ -513,7 +532,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
     }
 
     fn takes(&mut self, id: NodeId) -> bool {
-        C::NODE_IDS.contains(&id.get())
+        C::DECISION.node_ids.contains(&id.get())
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {

@@ -1,8 +1,9 @@
 //! What a bootloader has: the one owner of it, from the object dictionary down to the programmer.
 
-use core::ops::RangeInclusive;
-
 use canopen::program::ProgramStart;
+use shared_abi::layout;
+
+use crate::decision::Policy;
 
 /// What a bootloader has, all of it: for what it has not, the compiler leaves out the code. The same values make
 /// its dictionary ([`entries`](crate::bootloader::entries)), so no object is without its code.
@@ -30,12 +31,18 @@ pub trait Choices {
     const LSS_IDENTIFY: bool = true;
     /// Whether layer setting services may store node-ID and bit rate.
     const LSS_STORE: bool = true;
-    /// The node-IDs that the device takes: with another one no program starts.
-    const NODE_IDS: RangeInclusive<u8> = 1..=127;
+    /// What its boot stage decides by.
+    const DECISION: &'static Policy = &Policy::plain(layout::DEFAULT, &[1, 2]);
     /// Whether it may detect the bit rate of its bus by listening.
     const DETECTS_BIT_RATE: bool = true;
     /// 2007h/10.
     const PROGRAM_START: ProgramStart = ProgramStart::NONE;
+
+    /// Whether the entry strap asks for the bootloader now; `was` is whether it did at the last reset.
+    #[must_use]
+    fn entry_strap(was: bool) -> bool {
+        was
+    }
 }
 
 /// A bootloader with everything.

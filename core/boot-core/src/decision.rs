@@ -18,7 +18,7 @@ use crate::crc::CrcKind;
 use crate::flash::Flash;
 use crate::program::{verify, Invalid, VerifiedProgram};
 use crate::renewal::Places;
-use crate::store::{Key, Parameters, RenewalRecord};
+use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord};
 
 /// Everything that the boot stage reads once after a reset.
 #[derive(Clone, Copy, Debug)]
@@ -250,11 +250,11 @@ impl Stay {
 
 /// The start of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Start {
+pub struct Start<V = VectorTable> {
     /// Its number, 1 to 254.
     pub number: u8,
     /// For the jump: the proof of its checks.
-    pub vectors: VectorTable,
+    pub vectors: V,
     /// The program starts once without a release.
     pub trial: bool,
     /// The flash is locked before, until the next reset ([`VerifiedProgram::locks_flash`]).
@@ -292,7 +292,8 @@ pub enum Autostart {
     /// These, in this order. With an empty list the device waits for a command.
     List(&'static [u8]),
     /// The list that a function returns, for instance one that reads a switch. It runs in the boot stage,
-    /// before any peripheral is set up, and must leave the peripherals that it uses as after a reset.
+    /// before any peripheral is set up, and when 2007h/2 is read; it must leave the peripherals as it
+    /// finds them.
     Function(fn() -> &'static [u8]),
 }
 
@@ -423,7 +424,7 @@ pub fn choose<I>(
     let record = if policy.renewal { RenewalRecord::load(parameters, flash) } else { None };
     let mut trial_end = if policy.renewal { woken.trial_end(record) } else { TrialEnd::None };
     let request = woken.request_after(trial_end);
-    let programs = Programs { node_id: woken.node_id, flash, parameters, product };
+    let programs = Programs { node_id: woken.node_id, product, contents: Stored { flash, parameters } };
     let mut decision = programs.decide(Asked { request, strap: woken.strap, crash_resets });
     let would_start = match decision {
         Ok(_) => true,
@@ -448,6 +449,28 @@ pub fn choose<I>(
     Choice { store, waits, damage, exit }
 }
 
+/// What a bootloader knows of the next reset.
+#[derive(Clone, Copy, Debug)]
+pub struct Outlook {
+    /// The entry strap asks for the bootloader.
+    pub strap: bool,
+    /// The number of consecutive crash resets, as stored.
+    pub crash_resets: u32,
+    /// The node-ID that is valid from this reset on; 255 for none.
+    pub node_id: u8,
+}
+
+/// Why a power-on would leave the device in the bootloader, by the rules of [`choose`]; `None` if a program would
+/// start, after its rescue window perhaps.
+pub fn next_stay(outlook: Outlook, product: impl Product, contents: impl Contents) -> Option<Reason> {
+    let Outlook { strap, crash_resets, node_id } = outlook;
+    let programs = Programs { node_id, product, contents };
+    match programs.decide(Asked { request: None, strap, crash_resets }) {
+        Err(Stay { reason, held: 0, .. }) => Some(reason),
+        _ => None,
+    }
+}
+
 /// A program that may be started.
 struct Candidate {
     number: u8,
@@ -467,12 +490,103 @@ impl Candidate {
     }
 }
 
-/// The programs of the device. Each one that is tried is checked completely.
-struct Programs<'a, P, F, S> {
+/// The programs of the device. Each one that is tried is checked.
+struct Programs<P, C> {
     node_id: u8,
+    product: P,
+    contents: C,
+}
+
+/// What is known of the contents of the programs.
+pub trait Contents {
+    /// A program whose contents are good.
+    type Program: Sound;
+
+    /// Checks program `number`.
+    ///
+    /// # Errors
+    /// [`Reason::NoProgram`], or what is wrong with it.
+    fn check(&self, product: impl Product, number: u8) -> Result<Self::Program, Reason>;
+
+    /// As [`Parameters::is_nearly_full`].
+    fn is_nearly_full(&self) -> bool {
+        false
+    }
+}
+
+/// A program whose contents are good.
+pub trait Sound: Copy {
+    /// The proof of its checks.
+    type Vectors: Copy;
+    /// Whether it is released for autostart.
+    fn signed(&self) -> bool;
+    /// Whether it starts without a rescue window.
+    fn confirmed(&self) -> bool;
+    /// The vectors for the jump.
+    fn vectors(&self) -> Self::Vectors;
+    /// Whether the flash is locked before its start.
+    fn locks_flash(&self) -> bool;
+}
+
+impl Sound for VerifiedProgram {
+    type Vectors = VectorTable;
+
+    fn signed(&self) -> bool {
+        self.signed()
+    }
+
+    fn confirmed(&self) -> bool {
+        self.confirmed()
+    }
+
+    fn vectors(&self) -> VectorTable {
+        self.vectors()
+    }
+
+    fn locks_flash(&self) -> bool {
+        self.locks_flash()
+    }
+}
+
+impl Sound for &ProgramRecord {
+    type Vectors = ();
+
+    fn signed(&self) -> bool {
+        self.signed
+    }
+
+    fn confirmed(&self) -> bool {
+        self.confirmed
+    }
+
+    fn vectors(&self) {}
+
+    fn locks_flash(&self) -> bool {
+        false
+    }
+}
+
+/// The contents of the flash, checked completely.
+struct Stored<'a, F, S> {
     flash: &'a F,
     parameters: &'a S,
-    product: P,
+}
+
+impl<F: Flash, S: Parameters> Contents for Stored<'_, F, S> {
+    type Program = VerifiedProgram;
+
+    fn check(&self, product: impl Product, number: u8) -> Result<VerifiedProgram, Reason> {
+        let Policy { layout, crc, .. } = *product.policy();
+        verify(self.flash, self.parameters, layout, crc, number).map_err(|invalid| match invalid {
+            Invalid::NoSuchProgram | Invalid::Absent => Reason::NoProgram,
+            Invalid::Size | Invalid::Crc => Reason::Damaged,
+            Invalid::Vectors(_) => Reason::Vectors,
+        })
+    }
+
+    fn is_nearly_full(&self) -> bool {
+        self.parameters.is_nearly_full()
+    }
 }
 
 /// The inputs of a decision that a damaged RAM image changes.
@@ -483,9 +597,9 @@ struct Asked {
     crash_resets: u32,
 }
 
-impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
+impl<P: Product, C: Contents> Programs<P, C> {
     /// Decides between them and the bootloader.
-    fn decide(&self, asked: Asked) -> Result<Start, Stay> {
+    fn decide(&self, asked: Asked) -> Result<Start<<C::Program as Sound>::Vectors>, Stay> {
         let Policy { autostart, programs, max_crash_resets, .. } = *self.product.policy();
         let stay = |reason| Err(Stay::for_reason(reason));
         match asked.request {
@@ -529,7 +643,7 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
 
     /// The program that starts if there is no bootloader to stay in, neither for the entry strap
     /// nor for the reset pin or a rescue window: one with autostart, or any other one.
-    fn any(&self) -> Option<Start> {
+    fn any(&self) -> Option<Start<<C::Program as Sound>::Vectors>> {
         let Policy { autostart, programs, .. } = *self.product.policy();
         let start = |number: &u8| {
             let request = Some(BootRequest::Resume(*number));
@@ -541,7 +655,11 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
     }
 
     /// Decides about the start of one program.
-    fn start(&self, request: Option<BootRequest>, candidate: Candidate) -> Result<Start, Stay> {
+    fn start(
+        &self,
+        request: Option<BootRequest>,
+        candidate: Candidate,
+    ) -> Result<Start<<C::Program as Sound>::Vectors>, Stay> {
         let Candidate { number, trial, is_requested } = candidate;
         let Policy { node_ids, start_allowed, .. } = self.product.policy();
         let refused = if is_requested { number } else { 0 };
@@ -549,19 +667,18 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
         if !node_ids.contains(&self.node_id) {
             return refuse(Reason::NodeId, refused);
         }
-        match self.verify(number) {
-            Err(Invalid::NoSuchProgram | Invalid::Absent) => refuse(Reason::NoProgram, refused),
-            Err(Invalid::Size | Invalid::Crc) => refuse(Reason::Damaged, number),
-            Err(Invalid::Vectors(_)) => refuse(Reason::Vectors, number),
+        match self.check(number) {
+            Err(Reason::NoProgram) => refuse(Reason::NoProgram, refused),
+            Err(reason) => refuse(reason, number),
             Ok(program) if !(program.signed() || trial) => refuse(Reason::Unsigned, refused),
             Ok(_) if !start_allowed(number) => refuse(Reason::Forbidden, refused),
             Ok(program) => {
-                let window_ms = self.rescue_window(request, &program);
+                let window_ms = self.rescue_window(request, program.confirmed());
                 // The bootloader has just had its turn if it has left a request.
                 let resumed = matches!(request, Some(BootRequest::Resume(_)));
                 if window_ms > 0 {
                     Err(Stay::held(Reason::Rescue, number, window_ms))
-                } else if self.parameters.is_nearly_full() && !is_requested && !resumed {
+                } else if self.contents.is_nearly_full() && !is_requested && !resumed {
                     Err(Stay::held(Reason::Compaction, number, 0))
                 } else {
                     Ok(Start {
@@ -578,21 +695,21 @@ impl<P: Product, F: Flash, S: Parameters> Programs<'_, P, F, S> {
     /// How long the start of a program is held back, in ms. A requested start is not: the
     /// requesting master asks for the program at once, and this request would keep the device in
     /// the bootloader.
-    fn rescue_window(&self, request: Option<BootRequest>, program: &VerifiedProgram) -> u16 {
+    fn rescue_window(&self, request: Option<BootRequest>, confirmed: bool) -> u16 {
         match request {
-            None if program.confirmed() => self.product.policy().rescue_window_confirmed_ms,
+            None if confirmed => self.product.policy().rescue_window_confirmed_ms,
             // It has refused to leave.
             None | Some(BootRequest::Rescue) => self.product.policy().rescue_window_ms,
             Some(_) => 0,
         }
     }
 
-    fn verify(&self, number: u8) -> Result<VerifiedProgram, Invalid> {
-        let Policy { layout, programs, crc, .. } = *self.product.policy();
+    fn check(&self, number: u8) -> Result<C::Program, Reason> {
+        let Policy { layout, programs, .. } = *self.product.policy();
         // Data of the profile are no program.
         if programs.len() < layout.programs.len() && !programs.contains(&number) {
-            return Err(Invalid::NoSuchProgram);
+            return Err(Reason::NoProgram);
         }
-        verify(self.flash, self.parameters, layout, crc, number)
+        self.contents.check(self.product, number)
     }
 }

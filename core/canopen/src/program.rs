@@ -166,8 +166,11 @@ pub const PROGRAM_PARTIAL: u16 = 0x2006;
 pub const DEVICE_STATE: u16 = 0x2007;
 /// In [`DEVICE_STATE`]: the program number of the bootloader itself, 0 if it cannot be renewed.
 pub const STATE_BOOTLOADER: u8 = 1;
-/// In [`DEVICE_STATE`]: why the device stays in the bootloader (`shared_abi::boot_report::Reason`).
+/// In [`DEVICE_STATE`]: why a power-on would leave the device in the bootloader now
+/// (`shared_abi::boot_report::Reason`); [`STATE_STARTS`] if a program would start.
 pub const STATE_REASON: u8 = 2;
+/// The value of [`STATE_REASON`] if a program would start.
+pub const STATE_STARTS: u8 = 0xFF;
 /// In [`DEVICE_STATE`]: the reset by which the last program ended
 /// (`shared_abi::handoff::ResetCause`).
 pub const STATE_PROGRAM_RESET: u8 = 3;
@@ -188,6 +191,11 @@ pub const STATE_VERSIONS: u8 = 8;
 pub const STATE_RENEWAL: u8 = 9;
 /// In [`DEVICE_STATE`]: the [`ProgramStart`].
 pub const STATE_PROGRAM_START: u8 = 10;
+/// In [`DEVICE_STATE`]: why the device stayed in the bootloader at its last reset; the numbers are those of
+/// [`STATE_REASON`].
+pub const STATE_LAST_REASON: u8 = 11;
+/// In [`DEVICE_STATE`]: the programs that are released for autostart, number 1 in bit 0.
+pub const STATE_RELEASED: u8 = 12;
 
 /// How the bootloader starts programs ([`STATE_PROGRAM_START`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -248,8 +256,8 @@ pub enum Supply {
 pub const SUPPLY_DETAIL: u8 = 1;
 
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 9] = [
-    Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_START),
+pub const STATE_ENTRIES: [Entry; 11] = [
+    Entry::record(DEVICE_STATE, "Device state", STATE_RELEASED),
     Entry::sub(
         DEVICE_STATE,
         STATE_BOOTLOADER,
@@ -276,6 +284,8 @@ pub const STATE_ENTRIES: [Entry; 9] = [
     Entry::sub(DEVICE_STATE, STATE_OPTION_BYTES, "Option bytes", DataType::Unsigned32, Access::Ro),
     Entry::sub(DEVICE_STATE, STATE_SUPPLY, "Supply", DataType::Unsigned8, Access::Ro),
     Entry::sub(DEVICE_STATE, STATE_PROGRAM_START, "Start of programs", DataType::Unsigned32, Access::Const),
+    Entry::sub(DEVICE_STATE, STATE_LAST_REASON, "Reason of the last stay", DataType::Unsigned8, Access::Ro),
+    Entry::sub(DEVICE_STATE, STATE_RELEASED, "Released programs", DataType::Unsigned32, Access::Ro),
 ];
 
 /// The entries of [`DEVICE_STATE`] in an application.

@@ -671,7 +671,7 @@ pub(crate) fn detail_words(error: Option<FlashError>, detail: u16) -> String {
 fn why_words(state: Option<BootloaderState>) -> String {
     let Some(state) = state else { return String::new() };
     let ended = state.ended_by().map(|by| format!("; the program was ended by {}", source(by)));
-    format!("; {}{}", reason(state.reason), ended.unwrap_or_default())
+    format!("; {}{}", reason(state.stayed()), ended.unwrap_or_default())
 }
 
 /// Translates a gateway's error into the error of a transfer over the bus.

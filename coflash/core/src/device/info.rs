@@ -97,6 +97,8 @@ pub struct ProgramInfo {
     pub crc: Option<u32>,
     /// 2005h of coboot: version of the stored program, 0 if unknown.
     pub version: Option<u32>,
+    /// 2007h/12 of coboot: whether it is released for autostart; `None` from an application.
+    pub released: Option<bool>,
     /// 1F57h.
     #[serde(serialize_with = "json::status")]
     pub status: Option<FlashStatus>,
@@ -154,6 +156,10 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     };
     let security = cell(session, security)?.flatten();
     let state = if device_type.is_bootloader() { cell(session, read_state)?.flatten() } else { None };
+    for program in &mut programs {
+        let has_one = program.state() != Some(ProgramState::Absent);
+        program.released = state.and_then(|state| state.is_released(program.number)).filter(|_| has_one);
+    }
     Ok(DeviceInfo {
         node: session.node(),
         device_type,
@@ -220,7 +226,7 @@ pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInf
     let crc = number(program::PROGRAM_ID)?;
     let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);
     let version = number(program::PROGRAM_VERSION)?;
-    Ok(ProgramInfo { number: program, control, crc, version, status })
+    Ok(ProgramInfo { number: program, control, crc, version, released: None, status })
 }
 
 const NOT_REPORTED: &str = "not reported";
@@ -264,6 +270,12 @@ impl fmt::Display for DeviceInfo {
         }
         if let Some(state) = &self.state {
             writeln!(f, "  {:<17} {state}", "state")?;
+            if let Some(words) = state.last_reset() {
+                writeln!(f, "  {:<17} {words}", "last reset")?;
+            }
+            if let Some(advice) = state.advice() {
+                writeln!(f, "  {:<17} {advice}", "what to do")?;
+            }
             if let Some(words) = supply(state.supply) {
                 writeln!(f, "  {:<17} {words}", "supply")?;
             }
@@ -313,6 +325,9 @@ impl fmt::Display for ProgramInfo {
         }
         if let Some(version) = self.release() {
             writeln!(f, "    version         {version}")?;
+        }
+        if let Some(released) = self.released {
+            writeln!(f, "    released        {}", if released { "yes" } else { "no" })?;
         }
         if let Some(status) = self.status {
             write!(f, "    status          ")?;

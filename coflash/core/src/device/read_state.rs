@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use canopen::program::{
-    ProgramStart, DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_OPTION_BYTES, STATE_PROGRAM_RESET,
-    STATE_PROGRAM_START, STATE_REASON, STATE_SUPPLY,
+    ProgramStart, DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_LAST_REASON, STATE_OPTION_BYTES,
+    STATE_PROGRAM_RESET, STATE_PROGRAM_START, STATE_REASON, STATE_RELEASED, STATE_SUPPLY,
 };
 use canopen::Address;
 
@@ -21,12 +21,23 @@ pub fn read_state(session: &mut Session<'_>) -> Result<Option<BootloaderState>, 
     let mut number = |sub| reported(session.read_number(Address::new(DEVICE_STATE, sub)));
     let mut byte = |sub| Ok::<_, Error>(number(sub)?.map(|value| value as u8));
     let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
+    let last_reason = byte(STATE_LAST_REASON)?;
     let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
     let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
     let clock = byte(STATE_CLOCK)?.unwrap_or(0);
     let supply = byte(STATE_SUPPLY)?.unwrap_or(0);
     let option_bytes = number(STATE_OPTION_BYTES)?.filter(|value| *value != 0).map(OptionBytes);
-    Ok(Some(BootloaderState { reason, program_reset, crash_resets, clock, option_bytes, supply }))
+    let released = number(STATE_RELEASED)?;
+    Ok(Some(BootloaderState {
+        reason,
+        last_reason,
+        released,
+        program_reset,
+        crash_resets,
+        clock,
+        option_bytes,
+        supply,
+    }))
 }
 
 /// The state of a device that is in trouble already: an error of the read is no news.

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use canopen::program::{ClockSource, Supply};
+use canopen::program::{ClockSource, Supply, STATE_STARTS};
 use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
@@ -10,13 +10,20 @@ use shared_abi::renewal::TrialEnd;
 use shared_abi::warm_start::Damage;
 
 use super::option_bytes::OptionBytes;
+use crate::advice::Advice;
 
-/// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
+/// Why a device stays in the bootloader, and how its program ended. `Display` shows what is so now in one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct BootloaderState {
-    /// 2007h/2: the number of a [`Reason`].
+    /// 2007h/2: the number of the [`Reason`] why a power-on would leave the device in the bootloader now;
+    /// 255 if a program would start.
     pub reason: u8,
+    /// 2007h/11: the number of the [`Reason`] of the last stay. `None` from an older bootloader, whose
+    /// `reason` is this one.
+    pub last_reason: Option<u8>,
+    /// 2007h/12: the programs that are released for autostart, number 1 in bit 0; `None` if they are not known.
+    pub released: Option<u32>,
     /// 2007h/3: the number of a [`ResetCause`]; 0 if it is not known.
     pub program_reset: u8,
     /// 2007h/4: resets in a row by which a program ended and that nobody requested.
@@ -34,8 +41,70 @@ impl BootloaderState {
     #[must_use]
     pub fn ended_by(self) -> Option<ResetCause> {
         let cause = ResetCause::from_byte(self.program_reset);
-        let has_program = Reason::from_byte(self.reason) != Some(Reason::NoProgram);
-        (has_program && cause != ResetCause::Unknown).then_some(cause)
+        let had_program = self.stayed() != Reason::NoProgram as u8;
+        (had_program && cause != ResetCause::Unknown).then_some(cause)
+    }
+
+    /// The number of the [`Reason`] why the device stayed at its last reset.
+    #[must_use]
+    pub fn stayed(self) -> u8 {
+        self.last_reason.unwrap_or(self.reason)
+    }
+
+    /// Why the device would stay in the bootloader now, in words; `None` if a program would start.
+    #[must_use]
+    pub fn stays(self) -> Option<String> {
+        (self.reason != STATE_STARTS).then(|| reason(self.reason))
+    }
+
+    /// Whether a program (1 to 32) is released for autostart; `None` if that is not known.
+    #[must_use]
+    pub fn is_released(self, program: u8) -> Option<bool> {
+        let place = program.checked_sub(1).filter(|place| *place < 32)?;
+        self.released.map(|programs| programs >> place & 1 != 0)
+    }
+
+    /// The last reset in words: why the device stayed, and how its program ended. `None` from an older
+    /// bootloader.
+    #[must_use]
+    pub fn last_reset(self) -> Option<String> {
+        let stayed = past_reason(self.last_reason?);
+        Some(format!("it stayed in the bootloader: {stayed}{}", self.ends()))
+    }
+
+    /// How the program ended, as the rest of a sentence.
+    fn ends(self) -> String {
+        let by = self.ended_by().map(|by| format!("; the program was ended by {}", source(by)));
+        let resets = match self.crash_resets {
+            0 => String::new(),
+            1 => "; 1 reset that nobody requested".into(),
+            255 => "; 255 or more resets in a row that nobody requested".into(),
+            n => format!("; {n} resets in a row that nobody requested"),
+        };
+        by.unwrap_or_default() + &resets
+    }
+
+    /// What to do; `None` for a reason that this tool does not know.
+    #[must_use]
+    pub fn advice(self) -> Option<Advice> {
+        let has_passed = self.reason == STATE_STARTS;
+        Some(match Reason::from_byte(if has_passed { self.stayed() } else { self.reason })? {
+            Reason::Fault => Advice::BootloaderFault,
+            Reason::Rescue => Advice::AskedInWindow,
+            Reason::Renewal => Advice::RenewalOpen,
+            Reason::Compaction => Advice::Compacts,
+            _ if has_passed => Advice::StartNow,
+            Reason::Requested | Reason::TwoResets => Advice::StartNow,
+            Reason::Strap => Advice::ReleaseStrap,
+            Reason::CrashLoop => Advice::CrashLoop,
+            Reason::NoAutostart => Advice::StartByCommand,
+            Reason::NodeId => Advice::NodeIdForProduct,
+            Reason::Unsigned => Advice::ReleaseIt,
+            Reason::NoProgram => Advice::FlashFirst,
+            Reason::Damaged => Advice::FlashAgain,
+            Reason::Vectors => Advice::WrongFormat,
+            Reason::Forbidden => Advice::StartForbidden,
+        })
     }
 }
 
@@ -70,27 +139,63 @@ pub const fn supply(number: u8) -> Option<&'static str> {
 /// Why a device stays in the bootloader, in words.
 #[must_use]
 pub fn reason(number: u8) -> String {
+    reason_words(number)[0].replace("{}", &number.to_string())
+}
+
+/// Why a device stayed in the bootloader at its last reset, in words.
+fn past_reason(number: u8) -> String {
+    reason_words(number)[1].replace("{}", &number.to_string())
+}
+
+/// The words for a reason that holds, and for one that held.
+fn reason_words(number: u8) -> [&'static str; 2] {
+    const REQUESTED: &str = "it was called back";
+    const NO_AUTOSTART: &str = "no program starts by itself on this product";
+    const FAULT: &str = "the bootloader had a fault";
+    const RESCUE: &str = "somebody spoke to it in its rescue window";
+    const TWO_RESETS: &str = "its reset pin (NRST) was pulled twice within half a second";
+    const UNKNOWN: &str = "for a reason that this tool does not know ({})";
     match Reason::from_byte(number) {
-        Some(Reason::Requested) => "it was called back",
-        Some(Reason::Strap) => "its entry strap is set",
-        Some(Reason::CrashLoop) => {
-            "its program has ended too often in a row by a reset that nobody requested"
+        Some(Reason::Requested) => [REQUESTED; 2],
+        Some(Reason::Strap) => ["its entry strap is set", "its entry strap was set"],
+        Some(Reason::CrashLoop) => [
+            "its program has ended too often in a row by a reset that nobody requested",
+            "its program had ended too often in a row by a reset that nobody requested",
+        ],
+        Some(Reason::NoAutostart) => [NO_AUTOSTART; 2],
+        Some(Reason::NodeId) => [
+            "its node-ID is outside the range with which a program may start",
+            "its node-ID was outside the range with which a program may start",
+        ],
+        Some(Reason::Unsigned) => {
+            ["its program is not released for autostart", "its program was not released for autostart"]
         }
-        Some(Reason::NoAutostart) => "no program starts by itself on this product",
-        Some(Reason::NodeId) => "its node-ID is outside the range with which a program may start",
-        Some(Reason::Unsigned) => "its program is not released for autostart",
-        Some(Reason::NoProgram) => "it has no program",
-        Some(Reason::Fault) => "the bootloader had a fault",
-        Some(Reason::Rescue) => "somebody spoke to it in its rescue window",
-        Some(Reason::Damaged) => "its program differs from the one that was downloaded",
-        Some(Reason::Vectors) => "the first two words of its program are no stack and entry for this board",
-        Some(Reason::Forbidden) => "the product forbids the start of its program at present",
-        Some(Reason::Renewal) => "a new bootloader is on trial, or its trial has ended",
-        Some(Reason::TwoResets) => "its reset pin (NRST) was pulled twice within half a second",
-        Some(Reason::Compaction) => "it compacts its stored values, and starts its program then",
-        None => return format!("for a reason that this tool does not know ({number})"),
+        Some(Reason::NoProgram) => ["it has no program", "it had no program"],
+        Some(Reason::Fault) => [FAULT; 2],
+        Some(Reason::Rescue) => [RESCUE; 2],
+        Some(Reason::Damaged) => [
+            "its program differs from the one that was downloaded",
+            "its program differed from the one that was downloaded",
+        ],
+        Some(Reason::Vectors) => [
+            "the first two words of its program are no stack and entry for this board",
+            "the first two words of its program were no stack and entry for this board",
+        ],
+        Some(Reason::Forbidden) => [
+            "the product forbids the start of its program at present",
+            "the product forbade the start of its program",
+        ],
+        Some(Reason::Renewal) => [
+            "a new bootloader is on trial, or its trial has ended",
+            "a new bootloader was on trial, or its trial had ended",
+        ],
+        Some(Reason::TwoResets) => [TWO_RESETS; 2],
+        Some(Reason::Compaction) => [
+            "it compacts its stored values, and starts its program then",
+            "it had to compact its stored values before it starts its program",
+        ],
+        None => [UNKNOWN; 2],
     }
-    .to_string()
 }
 
 /// The end of a trial, in words: the rest of a sentence about the new bootloader.
@@ -119,15 +224,12 @@ const fn damage_words(damage: Damage) -> &'static str {
 
 impl fmt::Display for BootloaderState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "stays in the bootloader: {}", reason(self.reason))?;
-        if let Some(how) = self.ended_by() {
-            write!(f, "; the program was ended by {}", source(how))?;
+        match self.stays() {
+            Some(why) => write!(f, "stays in the bootloader: {why}")?,
+            None => write!(f, "in the bootloader; a reset starts its program")?,
         }
-        match self.crash_resets {
-            0 => {}
-            1 => write!(f, "; 1 reset that nobody requested")?,
-            255 => write!(f, "; 255 or more resets in a row that nobody requested")?,
-            n => write!(f, "; {n} resets in a row that nobody requested")?,
+        if self.last_reason.is_none() {
+            write!(f, "{}", self.ends())?;
         }
         if self.clock == ClockSource::Internal as u8 {
             write!(f, "; its crystal has failed, and it runs from its internal oscillator")?;
@@ -145,6 +247,8 @@ mod tests {
 
     const NOTHING: BootloaderState = BootloaderState {
         reason: 0,
+        last_reason: None,
+        released: None,
         program_reset: 0,
         crash_resets: 0,
         clock: 1,
@@ -152,6 +256,7 @@ mod tests {
         supply: 1,
     };
 
+    /// An older bootloader says why it stayed, and nothing else.
     #[test]
     fn each_state_has_its_words() {
         let state = |reason, program_reset, crash_resets| {
@@ -185,10 +290,40 @@ mod tests {
             low.to_string(),
             "stays in the bootloader: it has no program; its supply is too low to write its flash"
         );
-        // No two reasons share their words.
-        let mut words: Vec<_> = (0..=12).map(reason).collect();
-        words.sort();
-        words.dedup();
-        assert_eq!(words.len(), 13);
+    }
+
+    /// What is so now is not what was so at the last reset; each reason has words of its own, and advice.
+    #[test]
+    fn a_reason_that_has_passed_is_told_as_such() {
+        let state = BootloaderState { reason: 5, last_reason: Some(6), released: Some(2), ..NOTHING };
+        assert_eq!(state.to_string(), "stays in the bootloader: its program is not released for autostart");
+        assert_eq!(state.last_reset().unwrap(), "it stayed in the bootloader: it had no program");
+        assert_eq!([1, 2, 33].map(|program| state.is_released(program)), [Some(false), Some(true), None]);
+        let crashed =
+            BootloaderState { reason: 255, last_reason: Some(2), program_reset: 4, crash_resets: 3, ..state };
+        assert_eq!(crashed.to_string(), "in the bootloader; a reset starts its program");
+        assert!(crashed.last_reset().unwrap().ends_with(
+            "had ended too often in a row by a reset that nobody requested; the program was ended by the independent \
+             watchdog; 3 resets in a row that nobody requested"
+        ));
+        for words in [reason, past_reason] {
+            let mut all: Vec<_> = Reason::ALL.map(|reason| words(reason as u8)).to_vec();
+            all.sort();
+            all.dedup();
+            assert_eq!(all.len(), Reason::ALL.len());
+        }
+        for (now, last, advice) in [
+            (255, 0, Advice::StartNow),
+            (255, 5, Advice::StartNow),
+            (255, 7, Advice::BootloaderFault),
+            (255, 8, Advice::AskedInWindow),
+            (5, 8, Advice::ReleaseIt),
+            (1, 0, Advice::ReleaseStrap),
+        ] {
+            let state = BootloaderState { reason: now, last_reason: Some(last), ..NOTHING };
+            assert_eq!(state.advice(), Some(advice), "{now} after {last}");
+        }
+        let of = |reason| BootloaderState { reason, ..NOTHING }.advice();
+        assert!(Reason::ALL.iter().all(|reason| of(*reason as u8).is_some()) && of(200).is_none());
     }
 }

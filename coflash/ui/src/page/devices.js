@@ -122,7 +122,7 @@ function open(node) {
     ["Hardware", device.hardware ?? "unknown"],
     ["Software", device.software ?? "unknown"],
     ...sealed(device.security),
-    ...[["State", device.state], ["Supply", device.supply], ["Option bytes", device.option_bytes],
+    ...[["State", device.state], ["Last reset", device.last_reset], ["What to do", device.advice], ["Supply", device.supply], ["Option bytes", device.option_bytes],
       ["Bootloader", device.renewable]].filter(([, words]) => words),
     ...device.warnings.map((words) => ["Warning", words]),
     ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],

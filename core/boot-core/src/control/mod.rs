@@ -30,6 +30,7 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use crate::choices::{Choices, Everything, Has};
+use crate::decision::{Contents, Product};
 use crate::flash::Flash;
 use crate::intake::Intake;
 use crate::keys::Images;
@@ -63,6 +64,8 @@ struct Program {
     region: Region,
     /// The stored record; a copy, because the flash cannot be read while it is busy.
     record: Option<ProgramRecord>,
+    /// Without a record: why.
+    absent: Reason,
     /// 1F56h: the CRC that was computed last, or the stored one.
     identification: u32,
     /// Why the last block or command failed.
@@ -154,6 +157,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
             Program {
                 region,
                 record,
+                absent: Reason::NoProgram,
                 identification: record.map_or(0, |record| record.crc),
                 failure: None,
                 session: Session::Idle,
@@ -198,6 +202,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
         if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {
             state.record = None;
             state.identification = 0;
+            state.absent =
+                if report.reason == Reason::Damaged as u8 { Reason::Damaged } else { Reason::Vectors };
         }
     }
 
@@ -239,6 +245,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
             Some(_) => ProgramState::Stopped,
             None => ProgramState::Absent,
         }
+    }
+
+    /// 2007h/12: the programs that are released for autostart, number 1 in bit 0.
+    pub(crate) fn released(&self) -> u32 {
+        let of = |(place, state): (usize, &Program)| match state.record {
+            Some(record) if record.signed => 1 << place,
+            _ => 0,
+        };
+        self.programs.iter().take(32).enumerate().map(of).sum()
     }
 
     /// 1F56h: the CRC of the program, 0 if there is none.
@@ -405,6 +420,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
                 }
                 if let Some(state) = find::<C>(&mut self.programs, program) {
                     state.record = record;
+                    state.absent = Reason::NoProgram;
                     state.date = date::<C>(&self.parameters, flash, program, state.region, record);
                     if record.is_none() {
                         state.identification = 0;
@@ -559,6 +575,16 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
     /// The program with this number, if it exists.
     fn program(&self, program: u8) -> Option<&Program> {
         self.programs.get(place::<C>(PROGRAMS, program))
+    }
+}
+
+/// The programs as they were checked last: when they were stored, or by the boot stage.
+impl<'d, P: Parameters, const PROGRAMS: usize, C: Choices> Contents for &'d Downloader<'_, P, PROGRAMS, C> {
+    type Program = &'d ProgramRecord;
+
+    fn check(&self, _: impl Product, number: u8) -> Result<&'d ProgramRecord, Reason> {
+        let state = self.program(number).ok_or(Reason::NoProgram)?;
+        state.record.as_ref().ok_or(state.absent)
     }
 }
 

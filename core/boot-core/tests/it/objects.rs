@@ -1,11 +1,11 @@
 //! What the objects say, and what the device does beside a download: each object of each program,
 //! emergencies, layer setting services, the second server, and commands in each other's way.
 
-use std::ops::RangeInclusive;
 use std::task::Poll;
 
 use boot_core::bootloader::{Bootloader, Choices, Config, Everything, Extras};
 use boot_core::control::{Policy, Step};
+use boot_core::decision::{self, choose, Exit, Images, Woken};
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
@@ -24,6 +24,7 @@ use kit::rig::{
 use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::handoff::ResetCause;
 use shared_abi::label;
+use shared_abi::layout;
 use shared_abi::warm_start::BootRequest;
 
 /// 1F57h: the flash works, and nothing has failed.
@@ -387,7 +388,8 @@ struct Fixed;
 
 impl Choices for Fixed {
     const LSS_STORE: bool = false;
-    const NODE_IDS: RangeInclusive<u8> = 2..=100;
+    const DECISION: &'static decision::Policy =
+        &decision::Policy { node_ids: 2..=100, ..decision::Policy::plain(layout::DEFAULT, &[1]) };
     const PROGRAM_START: ProgramStart = ProgramStart { watchdog_ms: 0x0403, by_itself: [2, 1] };
 }
 
@@ -516,9 +518,77 @@ fn a_device_tells_why_it_stayed() {
     }
 }
 
-/// 2007h: what the boot stage reported.
+/// What the boot stage would choose after a power-on now: 255 for a program.
+fn next_choice(rig: &Rig) -> u8 {
+    let (flash, layout) = (rig.chip.model().clone(), rig.setup.layout);
+    let journal = Journal::open(&flash, layout.parameters);
+    let woken = Woken::power_on(rig.stored().node.id_or_none(), BitRate::K125);
+    let policy = decision::Policy::plain(layout, &[1, 2]);
+    match choose(&woken, &Images::SOUND, &flash, &journal, &policy).exit {
+        Exit::Bootloader { stay, .. } => stay.reason as u8,
+        _ => 255,
+    }
+}
+
+/// 2007h/2 is what is so now, and what the boot stage goes by; 2007h/11 is what was so at the last reset, and 2007h/12
+/// which programs are released.
+#[test]
+fn the_reason_to_stay_is_that_of_the_next_reset() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    let is = |rig: &mut Rig, what: &str, reason: u32, released: u32| {
+        rig.settle();
+        assert_eq!(u32::from(next_choice(rig)), reason, "{what}: the boot stage");
+        assert_eq!([2, 11, 12].map(|sub| rig.word(0x2007, sub)), [reason, 0, released], "{what}");
+    };
+    is(&mut rig, "a new device", 6, 0);
+    rig.install(1, &raw(&STANDARD_2, 1, 700));
+    is(&mut rig, "a raw image is released", 255, 1);
+    for (command, reason, released) in [(CLR_SIGNATURE, 5, 0), (SET_SIGNATURE, 255, 1), (CLR_SIGNATURE, 5, 0)]
+    {
+        rig.command(1, command).unwrap();
+        is(&mut rig, "a command", reason, released);
+    }
+    rig.install(2, &raw(&STANDARD_2, 2, 700));
+    is(&mut rig, "program 2 starts in its place", 255, 2);
+    for (program, reason) in [(2, 5), (1, 6)] {
+        for _ in 0..2 {
+            rig.command(program, CLEAR).unwrap();
+            rig.settle();
+        }
+        is(&mut rig, "erased", reason, 0);
+    }
+}
+
+/// 2007h: what the boot stage reported, and what is so now.
 #[test]
 fn the_state_of_the_device_is_what_the_boot_stage_reported() {
+    for (last, crash_resets, id, now) in [
+        (1, 0, 5, 1),
+        (2, 3, 5, 2),
+        (0, 2, 5, 255),
+        (9, 0, 5, 9),
+        (10, 0, 5, 10),
+        (4, 0, 255, 4),
+        (11, 0, 5, 255),
+    ] {
+        let mut rig = Rig::new(&STANDARD_1, 4096);
+        rig.install(1, &raw(&STANDARD_1, 1, 700));
+        rig.command(1, SET_SIGNATURE).unwrap();
+        rig.settle();
+        let mut flash = rig.chip.model().clone();
+        // A program that the boot stage has found damaged is none, whatever kept the device before.
+        let refused = u8::from([9, 10].contains(&now));
+        let reason = if refused > 0 { now } else { last };
+        let report = BootReport { reason, crash_resets, refused, ..BootReport::NONE };
+        let (buffer, sealed) = leaked(256);
+        let node = NodeParameters { id: NodeId::new(id), ..kit::bench::node() };
+        let mut node: Bootloader<'_, _, _, 1> =
+            Boot { config: &CONFIG, serial_number: 1, node, report }.on(&mut flash, buffer, sealed);
+        node.node_id_changed(NodeId::new(5));
+        let mut byte = [0];
+        assert_eq!(node.read(Address::new(0x2007, 2), &mut byte), Ok(1));
+        assert_eq!(byte, [now], "after {last}");
+    }
     let report = BootReport {
         reason: Reason::Unsigned as u8,
         program_reset: ResetCause::IndependentWatchdog as u8,
@@ -526,7 +596,7 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         ..BootReport::NONE
     };
     let mut node = reported(new_flash(), &CONFIG, report);
-    for (sub, value) in [(1, 0), (2, 5), (3, 4), (4, 3)] {
+    for (sub, value) in [(1, 0), (2, 2), (11, 5), (3, 4), (4, 3)] {
         let mut byte = [0xEE];
         assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
         assert_eq!(byte, [value], "2007h/{sub}");

@@ -1,7 +1,7 @@
 //! The advice for an error.
 
 use canopen::debugger::DEBUGGER;
-use canopen::program::{FlashError, ACCESS, EVENTS};
+use canopen::program::{FlashError, ProgramControl, ACCESS, EVENTS};
 use canopen::{AbortCode, NodeId};
 use coboot_can::AdapterError;
 use shared_abi::boot_report::Reason;
@@ -98,7 +98,7 @@ fn lss_advice(doing: LssDoing, failure: LssFailure) -> Advice {
 
 /// The advice for a program after whose start the bootloader runs, by what the device says.
 fn not_started_advice(state: Option<BootloaderState>) -> Advice {
-    let reason = state.and_then(|state| Reason::from_byte(state.reason));
+    let reason = state.and_then(|state| Reason::from_byte(state.stayed()));
     let ended_by = state.and_then(BootloaderState::ended_by);
     match (reason, ended_by) {
         (Some(Reason::NoProgram), _) => Advice::FlashFirst,
@@ -174,6 +174,11 @@ fn refusal_advice(doing: Doing, code: AbortCode) -> Advice {
         (Doing::Unlock, AbortCode::NO_OBJECT | AbortCode::NO_SUB_INDEX) => Advice::NeedsNoPassword,
         (Doing::Unlock, AbortCode::DEVICE_STATE) => Advice::PasswordLater,
         (Doing::Unlock, _) => Advice::WrongPassword,
+        // 1F57h gives the reason of a bootloader; that of an application is always 0.
+        (
+            Doing::Command(ProgramControl::SetSignature | ProgramControl::ClrSignature),
+            AbortCode::DEVICE_STATE,
+        ) => Advice::EnterFirst,
         (_, AbortCode::NO_OBJECT) if index == Some(DEBUGGER) => Advice::NoDebugger,
         (_, AbortCode::INVALID_VALUE) if index == Some(DEBUGGER) => Advice::NoAccessToBytes,
         (_, AbortCode::DEVICE_STATE) if index == Some(DEBUGGER) => Advice::ReadOutProtected,
