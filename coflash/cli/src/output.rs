@@ -269,7 +269,7 @@ impl Exit {
 #[derive(Debug)]
 pub(super) struct Failure {
     pub(super) exit: Exit,
-    /// The stable error number, if there is one.
+    /// The stable error number, if it is more exact than `legacy`.
     number: Option<u32>,
     /// The exit code of the manual's tools.
     pub(super) legacy: u32,
@@ -529,7 +529,7 @@ impl Failure {
     pub(super) fn value(&self) -> Value {
         json!({
             "error": {
-                "number": self.number.map(|number| format!("{number:#010x}")),
+                "number": format!("{:#010x}", self.number.unwrap_or(self.legacy)),
                 "exit": self.exit as u8,
                 "what": self.what,
                 "device": self.left.map(|left| left.state.name()),

@@ -133,6 +133,7 @@ fn procedure(
     }
     let downloaded = procedure.download(session, file, update)?;
     let Downloaded { repeats, took: transfer, released, renewal } = downloaded;
+    let mut watched = None;
     let running = match renewal {
         Some(renewal) => renewal.running,
         None if options.start => {
@@ -143,13 +144,18 @@ fn procedure(
             let running = procedure.start(session, update.original, options.program)?;
             watch::watch(session, starts, time)?;
             update.report(Phase::Started(running).into());
+            watched = Some(time);
             Some(running)
         }
         None => None,
     };
     // 1F56h of a program is not that of a new bootloader.
     if options.verify && renewal.is_none() {
-        let crc = compare_crc(session, options.program, file.crcs())?;
+        let crc = compare_crc(session, options.program, file.crcs());
+        let crc = match watched {
+            Some(_) => crc.map_err(|error| watch::fell_silent(session, began, error))?,
+            None => crc?,
+        };
         update.report(Phase::VerifiedAgain { crc }.into());
     }
     let took = session.now().saturating_sub(began);
@@ -163,6 +169,7 @@ fn procedure(
         transfer,
         transfers,
         running,
+        watched,
         released,
         dialect,
         renewal: renewal.map(|renewal| Renewal { took, ..renewal }),

@@ -35,6 +35,9 @@ pub struct Report {
     /// The device type of what runs now, if the program was started.
     #[serde(serialize_with = "device_type")]
     pub running: Option<DeviceType>,
+    /// How long the program was watched after its start, if it was started; 0 for not at all.
+    #[serde(rename = "watched_seconds", serialize_with = "watched_seconds")]
+    pub watched: Option<Duration>,
     /// Whether the program is released for autostart (83h); `None` in a dialect without a release.
     pub released: Option<bool>,
     /// The dialect of the device.
@@ -60,6 +63,10 @@ fn device_type<S: Serializer>(running: &Option<DeviceType>, serializer: S) -> Re
     running.map(|running| running.0).serialize(serializer)
 }
 
+fn watched_seconds<S: Serializer>(watched: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+    watched.map(|watched| watched.as_secs_f64()).serialize(serializer)
+}
+
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if let Some(renewal) = &self.renewal {
@@ -67,9 +74,14 @@ impl fmt::Display for Report {
         }
         write!(f, "done in {:.1} s", self.took.as_secs_f64())?;
         match self.repeats {
-            0 => Ok(()),
-            1 => f.write_str(", 1 block sent again"),
-            blocks => write!(f, ", {blocks} blocks sent again"),
+            0 => {}
+            1 => f.write_str(", 1 block sent again")?,
+            blocks => write!(f, ", {blocks} blocks sent again")?,
+        }
+        match self.watched {
+            None => Ok(()),
+            Some(Duration::ZERO) => f.write_str("; the program was not watched"),
+            Some(time) => write!(f, "; the program was watched for {:.1} s", time.as_secs_f64()),
         }
     }
 }

@@ -22,6 +22,7 @@ pub(super) fn run(session: &mut Session<'_>, update: &mut RunningUpdate<'_>) -> 
         Some(target) => check_target(session, target),
         None => Ok(()),
     });
+    let right = right.map_err(|error| failed(watch::fell_silent(session, began, error)));
     // Even a wrong program must not keep running.
     let back = call_back(session).map_err(failed);
     right?;

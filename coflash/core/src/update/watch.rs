@@ -9,7 +9,7 @@ use shared_abi::handoff::ResetCause;
 
 use super::options::FlashOptions;
 use crate::device::error::{Ended, Error};
-use crate::device::read_state::{program_watchdog, read_state};
+use crate::device::read_state::{program_watchdog, state_after_failure};
 use crate::device::state::BootloaderState;
 use crate::device::{DeviceType, Dialect, Session};
 
@@ -55,7 +55,17 @@ pub(super) fn watch(session: &mut Session<'_>, began: Duration, time: Duration) 
         None if !has_ended => {
             Err(Error::FellSilent { node, elsewhere: session.booted_elsewhere_since(began) })
         }
-        running => Err(Error::ProgramEnded { node, ended: Ended { ran, by: ended_by(session, running)? } }),
+        running => Err(Error::ProgramEnded { node, ended: Ended { ran, by: ended_by(session, running) } }),
+    }
+}
+
+/// A program that was started at `began` and does not answer a later request has fallen silent.
+pub(super) fn fell_silent(session: &mut Session<'_>, began: Duration, error: Error) -> Error {
+    match error {
+        Error::NoAnswer { node, .. } => {
+            Error::FellSilent { node, elsewhere: session.booted_elsewhere_since(began) }
+        }
+        error => error,
     }
 }
 
@@ -69,9 +79,7 @@ fn answering(session: &mut Session<'_>) -> Result<Option<DeviceType>, Error> {
 }
 
 /// How the program ended, as the bootloader reports it.
-fn ended_by(session: &mut Session<'_>, running: Option<DeviceType>) -> Result<Option<ResetCause>, Error> {
-    if !running.is_some_and(DeviceType::is_bootloader) {
-        return Ok(None);
-    }
-    Ok(read_state(session)?.and_then(BootloaderState::ended_by))
+fn ended_by(session: &mut Session<'_>, running: Option<DeviceType>) -> Option<ResetCause> {
+    running.filter(|running| running.is_bootloader())?;
+    state_after_failure(session).and_then(BootloaderState::ended_by)
 }

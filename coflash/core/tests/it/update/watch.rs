@@ -137,6 +137,21 @@ fn a_program_that_falls_silent_in_its_watch_is_told() {
     }
 }
 
+/// Whatever the tool reads last: a program that falls silent between two requests is at fault, not the bus.
+#[test]
+fn a_program_that_falls_silent_between_two_requests_has_failed_its_trial() {
+    let mut silences = 0;
+    for after in (0..).map(|step| Duration::from_micros(1_000_000 + 250 * step)) {
+        let mut fake = device(&[Some(End::Reset { after, into: None })], None);
+        match run(&mut fake, FlashOptions::default()).0 {
+            Ok(_) => break,
+            Err(error) => assert!(matches!(error, Error::TrialFailed { .. }), "{after:?}: {error}"),
+        }
+        silences += 1;
+    }
+    assert!(silences > 3, "{silences}");
+}
+
 /// The adapter dies at any frame of a trial: the error is that of the adapter, and what is known of the
 /// device is said. It is the same for each of two devices.
 #[test]
