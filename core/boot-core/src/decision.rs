@@ -16,9 +16,9 @@ use shared_abi::warm_start::{BootRequest, Damage, Owed, TrialStep};
 
 use crate::crc::CrcKind;
 use crate::flash::Flash;
-use crate::program::{verify, Invalid, VerifiedProgram};
+use crate::program::{verify, Invalid};
 use crate::renewal::Places;
-use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord};
+use crate::store::{Key, Parameters, RenewalRecord};
 
 /// Everything that the boot stage reads once after a reset.
 #[derive(Clone, Copy, Debug)]
@@ -499,69 +499,17 @@ struct Programs<P, C> {
 
 /// What is known of the contents of the programs.
 pub trait Contents {
-    /// A program whose contents are good.
-    type Program: Sound;
+    /// The vectors of a program whose contents are good: the proof of its checks.
+    type Vectors: Copy;
 
-    /// Checks program `number`.
+    /// Checks a program.
     ///
     /// # Errors
     /// [`Reason::NoProgram`], or what is wrong with it.
-    fn check(&self, product: impl Product, number: u8) -> Result<Self::Program, Reason>;
+    fn check(&self, product: impl Product, number: u8) -> Result<Sound<Self::Vectors>, Reason>;
 
     /// As [`Parameters::is_nearly_full`].
     fn is_nearly_full(&self) -> bool {
-        false
-    }
-}
-
-/// A program whose contents are good.
-pub trait Sound: Copy {
-    /// The proof of its checks.
-    type Vectors: Copy;
-    /// Whether it is released for autostart.
-    fn signed(&self) -> bool;
-    /// Whether it starts without a rescue window.
-    fn confirmed(&self) -> bool;
-    /// The vectors for the jump.
-    fn vectors(&self) -> Self::Vectors;
-    /// Whether the flash is locked before its start.
-    fn locks_flash(&self) -> bool;
-}
-
-impl Sound for VerifiedProgram {
-    type Vectors = VectorTable;
-
-    fn signed(&self) -> bool {
-        self.signed()
-    }
-
-    fn confirmed(&self) -> bool {
-        self.confirmed()
-    }
-
-    fn vectors(&self) -> VectorTable {
-        self.vectors()
-    }
-
-    fn locks_flash(&self) -> bool {
-        self.locks_flash()
-    }
-}
-
-impl Sound for &ProgramRecord {
-    type Vectors = ();
-
-    fn signed(&self) -> bool {
-        self.signed
-    }
-
-    fn confirmed(&self) -> bool {
-        self.confirmed
-    }
-
-    fn vectors(&self) {}
-
-    fn locks_flash(&self) -> bool {
         false
     }
 }
@@ -573,20 +521,39 @@ struct Stored<'a, F, S> {
 }
 
 impl<F: Flash, S: Parameters> Contents for Stored<'_, F, S> {
-    type Program = VerifiedProgram;
+    type Vectors = VectorTable;
 
-    fn check(&self, product: impl Product, number: u8) -> Result<VerifiedProgram, Reason> {
+    fn check(&self, product: impl Product, number: u8) -> Result<Sound<VectorTable>, Reason> {
         let Policy { layout, crc, .. } = *product.policy();
-        verify(self.flash, self.parameters, layout, crc, number).map_err(|invalid| match invalid {
-            Invalid::NoSuchProgram | Invalid::Absent => Reason::NoProgram,
-            Invalid::Size | Invalid::Crc => Reason::Damaged,
-            Invalid::Vectors(_) => Reason::Vectors,
-        })
+        match verify(self.flash, self.parameters, layout, crc, number) {
+            Ok(program) => Ok(Sound {
+                signed: program.signed(),
+                confirmed: program.confirmed(),
+                locks_flash: program.locks_flash(),
+                vectors: program.vectors(),
+            }),
+            Err(Invalid::NoSuchProgram | Invalid::Absent) => Err(Reason::NoProgram),
+            Err(Invalid::Size | Invalid::Crc) => Err(Reason::Damaged),
+            Err(Invalid::Vectors(_)) => Err(Reason::Vectors),
+        }
     }
 
     fn is_nearly_full(&self) -> bool {
         self.parameters.is_nearly_full()
     }
+}
+
+/// A program whose contents are good.
+#[derive(Clone, Copy, Debug)]
+pub struct Sound<V> {
+    /// Whether it is released for autostart.
+    pub signed: bool,
+    /// Whether it starts without a rescue window.
+    pub confirmed: bool,
+    /// Whether the flash is locked before its start.
+    pub locks_flash: bool,
+    /// The proof of its checks.
+    pub vectors: V,
 }
 
 /// The inputs of a decision that a damaged RAM image changes.
@@ -599,7 +566,7 @@ struct Asked {
 
 impl<P: Product, C: Contents> Programs<P, C> {
     /// Decides between them and the bootloader.
-    fn decide(&self, asked: Asked) -> Result<Start<<C::Program as Sound>::Vectors>, Stay> {
+    fn decide(&self, asked: Asked) -> Result<Start<C::Vectors>, Stay> {
         let Policy { autostart, programs, max_crash_resets, .. } = *self.product.policy();
         let stay = |reason| Err(Stay::for_reason(reason));
         match asked.request {
@@ -643,7 +610,7 @@ impl<P: Product, C: Contents> Programs<P, C> {
 
     /// The program that starts if there is no bootloader to stay in, neither for the entry strap
     /// nor for the reset pin or a rescue window: one with autostart, or any other one.
-    fn any(&self) -> Option<Start<<C::Program as Sound>::Vectors>> {
+    fn any(&self) -> Option<Start<C::Vectors>> {
         let Policy { autostart, programs, .. } = *self.product.policy();
         let start = |number: &u8| {
             let request = Some(BootRequest::Resume(*number));
@@ -655,11 +622,7 @@ impl<P: Product, C: Contents> Programs<P, C> {
     }
 
     /// Decides about the start of one program.
-    fn start(
-        &self,
-        request: Option<BootRequest>,
-        candidate: Candidate,
-    ) -> Result<Start<<C::Program as Sound>::Vectors>, Stay> {
+    fn start(&self, request: Option<BootRequest>, candidate: Candidate) -> Result<Start<C::Vectors>, Stay> {
         let Candidate { number, trial, is_requested } = candidate;
         let Policy { node_ids, start_allowed, .. } = self.product.policy();
         let refused = if is_requested { number } else { 0 };
@@ -670,10 +633,10 @@ impl<P: Product, C: Contents> Programs<P, C> {
         match self.check(number) {
             Err(Reason::NoProgram) => refuse(Reason::NoProgram, refused),
             Err(reason) => refuse(reason, number),
-            Ok(program) if !(program.signed() || trial) => refuse(Reason::Unsigned, refused),
+            Ok(program) if !(program.signed || trial) => refuse(Reason::Unsigned, refused),
             Ok(_) if !start_allowed(number) => refuse(Reason::Forbidden, refused),
             Ok(program) => {
-                let window_ms = self.rescue_window(request, program.confirmed());
+                let window_ms = self.rescue_window(request, program.confirmed);
                 // The bootloader has just had its turn if it has left a request.
                 let resumed = matches!(request, Some(BootRequest::Resume(_)));
                 if window_ms > 0 {
@@ -683,9 +646,9 @@ impl<P: Product, C: Contents> Programs<P, C> {
                 } else {
                     Ok(Start {
                         number,
-                        vectors: program.vectors(),
-                        trial: trial && !program.signed(),
-                        locks_flash: program.locks_flash(),
+                        vectors: program.vectors,
+                        trial: trial && !program.signed,
+                        locks_flash: program.locks_flash,
                     })
                 }
             }
@@ -704,7 +667,7 @@ impl<P: Product, C: Contents> Programs<P, C> {
         }
     }
 
-    fn check(&self, number: u8) -> Result<C::Program, Reason> {
+    fn check(&self, number: u8) -> Result<Sound<C::Vectors>, Reason> {
         let Policy { layout, programs, .. } = *self.product.policy();
         // Data of the profile are no program.
         if programs.len() < layout.programs.len() && !programs.contains(&number) {

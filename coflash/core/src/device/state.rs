@@ -139,63 +139,40 @@ pub const fn supply(number: u8) -> Option<&'static str> {
 /// Why a device stays in the bootloader, in words.
 #[must_use]
 pub fn reason(number: u8) -> String {
-    reason_words(number)[0].replace("{}", &number.to_string())
-}
-
-/// Why a device stayed in the bootloader at its last reset, in words.
-fn past_reason(number: u8) -> String {
-    reason_words(number)[1].replace("{}", &number.to_string())
-}
-
-/// The words for a reason that holds, and for one that held.
-fn reason_words(number: u8) -> [&'static str; 2] {
-    const REQUESTED: &str = "it was called back";
-    const NO_AUTOSTART: &str = "no program starts by itself on this product";
-    const FAULT: &str = "the bootloader had a fault";
-    const RESCUE: &str = "somebody spoke to it in its rescue window";
-    const TWO_RESETS: &str = "its reset pin (NRST) was pulled twice within half a second";
-    const UNKNOWN: &str = "for a reason that this tool does not know ({})";
     match Reason::from_byte(number) {
-        Some(Reason::Requested) => [REQUESTED; 2],
-        Some(Reason::Strap) => ["its entry strap is set", "its entry strap was set"],
-        Some(Reason::CrashLoop) => [
-            "its program has ended too often in a row by a reset that nobody requested",
-            "its program had ended too often in a row by a reset that nobody requested",
-        ],
-        Some(Reason::NoAutostart) => [NO_AUTOSTART; 2],
-        Some(Reason::NodeId) => [
-            "its node-ID is outside the range with which a program may start",
-            "its node-ID was outside the range with which a program may start",
-        ],
-        Some(Reason::Unsigned) => {
-            ["its program is not released for autostart", "its program was not released for autostart"]
+        Some(Reason::Requested) => "it was called back",
+        Some(Reason::Strap) => "its entry strap is set",
+        Some(Reason::CrashLoop) => {
+            "its program has ended too often in a row by a reset that nobody requested"
         }
-        Some(Reason::NoProgram) => ["it has no program", "it had no program"],
-        Some(Reason::Fault) => [FAULT; 2],
-        Some(Reason::Rescue) => [RESCUE; 2],
-        Some(Reason::Damaged) => [
-            "its program differs from the one that was downloaded",
-            "its program differed from the one that was downloaded",
-        ],
-        Some(Reason::Vectors) => [
-            "the first two words of its program are no stack and entry for this board",
-            "the first two words of its program were no stack and entry for this board",
-        ],
-        Some(Reason::Forbidden) => [
-            "the product forbids the start of its program at present",
-            "the product forbade the start of its program",
-        ],
-        Some(Reason::Renewal) => [
-            "a new bootloader is on trial, or its trial has ended",
-            "a new bootloader was on trial, or its trial had ended",
-        ],
-        Some(Reason::TwoResets) => [TWO_RESETS; 2],
-        Some(Reason::Compaction) => [
-            "it compacts its stored values, and starts its program then",
-            "it had to compact its stored values before it starts its program",
-        ],
-        None => [UNKNOWN; 2],
+        Some(Reason::NoAutostart) => "no program starts by itself on this product",
+        Some(Reason::NodeId) => "its node-ID is outside the range with which a program may start",
+        Some(Reason::Unsigned) => "its program is not released for autostart",
+        Some(Reason::NoProgram) => "it has no program",
+        Some(Reason::Fault) => "the bootloader had a fault",
+        Some(Reason::Rescue) => "somebody spoke to it in its rescue window",
+        Some(Reason::Damaged) => "its program differs from the one that was downloaded",
+        Some(Reason::Vectors) => "the first two words of its program are no stack and entry for this board",
+        Some(Reason::Forbidden) => "the product forbids the start of its program at present",
+        Some(Reason::Renewal) => "a new bootloader is on trial, or its trial has ended",
+        Some(Reason::TwoResets) => "its reset pin (NRST) was pulled twice within half a second",
+        Some(Reason::Compaction) => "it compacts its stored values, and starts its program then",
+        None => return format!("for a reason that this tool does not know ({number})"),
     }
+    .to_string()
+}
+
+/// Why a device stayed in the bootloader at its last reset: the words of [`reason`] for what may have passed.
+fn past_reason(number: u8) -> String {
+    const PAST: [(&str, &str); 6] = [
+        (" is ", " was "),
+        (" has ", " had "),
+        (" are ", " were "),
+        (" differs ", " differed "),
+        ("forbids the start of its program at present", "forbade the start of its program"),
+        ("compacts its stored values, and starts", "compacted its stored values, to start"),
+    ];
+    PAST.iter().fold(reason(number), |words, (now, then)| words.replace(now, then))
 }
 
 /// The end of a trial, in words: the rest of a sentence about the new bootloader.

@@ -30,7 +30,7 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use crate::choices::{Choices, Everything, Has};
-use crate::decision::{Contents, Product};
+use crate::decision::{Contents, Product, Sound};
 use crate::flash::Flash;
 use crate::intake::Intake;
 use crate::keys::Images;
@@ -579,12 +579,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
 }
 
 /// The programs as they were checked last: when they were stored, or by the boot stage.
-impl<'d, P: Parameters, const PROGRAMS: usize, C: Choices> Contents for &'d Downloader<'_, P, PROGRAMS, C> {
-    type Program = &'d ProgramRecord;
+impl<P: Parameters, const PROGRAMS: usize, C: Choices> Contents for &Downloader<'_, P, PROGRAMS, C> {
+    type Vectors = ();
 
-    fn check(&self, _: impl Product, number: u8) -> Result<&'d ProgramRecord, Reason> {
+    fn check(&self, _: impl Product, number: u8) -> Result<Sound<()>, Reason> {
         let state = self.program(number).ok_or(Reason::NoProgram)?;
-        state.record.as_ref().ok_or(state.absent)
+        match &state.record {
+            &Some(ProgramRecord { signed, confirmed, .. }) => {
+                Ok(Sound { signed, confirmed, locks_flash: false, vectors: () })
+            }
+            None => Err(state.absent),
+        }
     }
 }
 
