@@ -281,21 +281,20 @@ impl Convert {
 impl Labels {
     /// The contents of block 0 for the program in this file.
     pub(super) fn label(&self, file: &Path) -> Result<Label, Failure> {
+        // A build system may set the variable for all of its commands.
+        let epoch = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|epoch| epoch.parse().ok());
+        let is_without_date = self.no_label || self.vid.is_some() && self.ver.is_none();
+        if is_without_date && self.date.is_some() && self.date != epoch {
+            let advice = "give --ver, too, or leave out --date";
+            return Err(Failure::usage("block 0 has no place for --date without --ver", advice));
+        }
         if self.no_label {
             return Ok(Label::None);
         }
         let (Some(vendor_id), Some(product_code)) = (self.vid, self.pid) else {
             return Ok(Label::OfImage { date: self.date.unwrap_or(0) });
         };
-        let Some(version) = self.ver else {
-            // A build system may set the variable for all of its commands.
-            let epoch = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|epoch| epoch.parse().ok());
-            if self.date.is_some() && self.date != epoch {
-                let advice = "give --ver, too, or leave out --date";
-                return Err(Failure::usage("with --vid and --pid, --date needs --ver", advice));
-            }
-            return Ok(Label::Device { vendor_id, product_code });
-        };
+        let Some(version) = self.ver else { return Ok(Label::Device { vendor_id, product_code }) };
         let date = match self.date {
             Some(date) => date,
             // The same file always gives the same block 0: otherwise a download that was cut off

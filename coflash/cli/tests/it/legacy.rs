@@ -275,6 +275,10 @@ fn a_wrong_node_id_has_the_manuals_number() {
         assert_eq!((done.exit, &json["error"]["number"]), (2, &"0x60000017".into()), "{words:?}: {json}");
         assert!(json["error"]["what"].as_str().unwrap().contains(expected), "{words:?}: {json}");
     }
+    // Any other wrong command line has the number with which the manual's tools would end.
+    let json: serde_json::Value =
+        serde_json::from_str(&coflash(&["--json", "flash", "--no-such"]).out).unwrap();
+    assert_eq!(json["error"]["number"], "0x60000018");
     // This tool has no node-ID of its own.
     let (bus, server) = serve(quick(BOOTLOADER).at(127, 1));
     let done = dot_net("blcop_app.bin", "-F blcop_app.bin --node 127", &bus);

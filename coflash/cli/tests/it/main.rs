@@ -340,6 +340,12 @@ fn the_label_is_shown_and_goes_into_block_0() {
         assert_eq!(bytes[12..12 + block.len()], block, "{options:?}");
         assert_eq!(done.out.contains("as its label says"), data.len() == 6, "{}", done.out);
     }
+    // A date that would be lost is refused.
+    for options in [&["--vid", "1", "--pid", "2"][..], &["--no-label"]] {
+        let date = ["--date", "1420070400"];
+        let done = coflash(&[&["convert", &file, &out][..], &raw, options, &date].concat());
+        assert!(done.exit == 2 && done.err.contains("without --ver"), "{options:?}: {}", done.err);
+    }
     // The block file has the label, too, and `inspect` shows it.
     let done = coflash(&["inspect", &out]);
     assert!(done.out.contains("  label        vendor-ID 00000319h"), "{}", done.out);
