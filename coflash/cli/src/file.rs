@@ -145,7 +145,9 @@ impl Source {
         label: Label,
     ) -> Result<Converted, Failure> {
         let options = self.options(self.place.options(program)?, label);
-        program_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+        let mut done = program_of(firmware, &options).map_err(|error| Failure::convert(error, file))?;
+        done.notes.extend(Note::of_staging(done.program.span().last, self.layout()?));
+        Ok(done)
     }
 
     /// How to read a file for program `number` of a device. Whether its board has such a program is of no

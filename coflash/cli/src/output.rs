@@ -552,6 +552,11 @@ impl Failure {
 impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
         let cause = &error.error.cause;
+        let text = error.to_string();
+        if let (Cause::Foreign(_) | Cause::Judged(_), Some(advice)) = (cause, cause.advice()) {
+            let what = text.strip_suffix(&format!(": {advice}")).unwrap_or(&text).to_owned();
+            return Self::new(Exit::File, what).numbered(cause.number()).advised(advice);
+        }
         let advice = match cause {
             Cause::Io(error) => match error.kind() {
                 io::ErrorKind::NotFound => "check the file's name and the current folder",
@@ -561,7 +566,6 @@ impl From<FileError> for Failure {
             },
             Cause::Empty => "the file is empty: build the program again, or copy the file again",
             Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
-            Cause::Foreign { advice, .. } => advice,
             Cause::NotNamedFormat { found: Some(_), .. } => "leave -I out: the first bytes show the format",
             Cause::NotNamedFormat { found: None, .. } => {
                 "name the right file, or leave -I out: without it the tool says what the file is"
@@ -598,7 +602,7 @@ impl From<FileError> for Failure {
             _ => "",
         };
         let advice = Some(advice.to_string()).filter(|advice| !advice.is_empty());
-        Self { advice, ..Self::new(Exit::File, error.to_string()).numbered(cause.number()) }
+        Self { advice, ..Self::new(Exit::File, text).numbered(cause.number()) }
     }
 }
 

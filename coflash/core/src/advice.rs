@@ -366,12 +366,12 @@ advice! {
     AreaEeprom => "an STM32F4 has no data EEPROM: leave this section out of the file",
     /// For data in the option bytes.
     AreaOptionBytes => "a bootloader does not write them: leave the section out of the file[ (objcopy \
-        --remove-section)|], and set option bytes with a debug probe",
+        --remove-section, or --start-address and --end-address here)|], and set option bytes with a debug probe",
     /// For data in the system memory.
     AreaSystemMemory => "it cannot be written: leave this section out of the file",
     /// For data in the OTP area.
     AreaOtp => "a bootloader does not write it: leave the section out of the file[ (objcopy \
-        --remove-section)|], and write it with a debug probe",
+        --remove-section, or --start-address and --end-address here)|], and write it with a debug probe",
     /// For data in RAM.
     AreaRam => "it is empty after power-on: give the section a load address in the flash (AT > FLASH), from \
         where the start-up of the program copies it, or make it NOLOAD",
@@ -423,6 +423,25 @@ advice! {
         without a base]",
     /// For a sealed image that its tool made wrong.
     SealAgain => "seal the program again: the tool that made this file has a fault",
+    /// For an archive.
+    Unpack => "unpack it, and [give|choose] the file in it",
+    /// For a file of another tool or kind.
+    Linked => "[give|choose] the linker's output: ELF, Intel HEX or S-record",
+    /// For a page in place of a file.
+    FetchAgain => "fetch the file itself, not the page that leads to it",
+    /// For an image of MCUboot.
+    Unsigned => "[give|choose] the image before imgtool has signed it (of Zephyr zephyr.elf), linked for this \
+        bootloader without room for MCUboot's header (CONFIG_BOOTLOADER_MCUBOOT=n, CONFIG_ROM_START_OFFSET=0)",
+    /// For a file with a DFU suffix.
+    DfuSuffix => "[give|choose] the linker's output, or take the suffix off (dfu-suffix --delete)",
+    /// For a file with programs for several boards.
+    OneBoard => "[give|choose] the HEX file of your board alone",
+    /// For a file with a program and other data.
+    ProgramAlone => "[give|choose] the file of the program alone[, or leave out the rest: --start-address with the \
+        begin of the program, and --end-address|]; other data are written in production, with a debug probe",
+    /// For a program that covers staging.
+    EndBeforeStaging => "for a renewal later, let the program end before that, with what the tool chain adds at \
+        its end: a checksum, a trailer, fill bytes",
     /// For a raw binary among other files.
     RawNeedsAddress => "[for a raw binary give -I binary and --start-address|a raw binary needs a board]",
     /// For a sealed image in the place of a program.

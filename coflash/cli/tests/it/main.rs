@@ -180,6 +180,8 @@ fn each_fault_of_a_file_says_what_to_do() {
         ("big-endian", with(5, 2), "Arm"),
         ("another machine", with(18, 243), "Arm"),
         ("an object file", with(16, 1), "the linker's output"),
+        ("an archive", b"PK\x03\x04".to_vec(), "unpack it"),
+        ("an image for MCUboot", b"\x3D\xB8\xF3\x96\0\0\0\0".to_vec(), "zephyr.elf"),
         (
             "other data twice",
             hex.replace(end, ":02000004080 1F1\n:0100000055AA\n:00000001FF").replace(' ', "").into_bytes(),
@@ -230,6 +232,16 @@ fn inspect_tells_what_a_file_holds() {
     let far = folder.file("far.hex", far.as_bytes());
     coflash(&["inspect", &far]).good();
     coflash(&["inspect", &far, "--board", "nucleo-f446re"]).fails(3, &["lies outside"]);
+    // Fill bytes up to the end of the flash, where a new bootloader waits (RM0090 table 5: sector
+    // 11).
+    let mut full = vec![0xFF; 0xE_0000];
+    full[..8].copy_from_slice(&[0xC0, 0xFF, 1, 0x20, 1, 2, 2, 8]);
+    let (full, out) = (folder.file("full.bin", &full), folder.path("full.blk"));
+    for words in [&["inspect", &full][..], &["convert", &full, &out]] {
+        let done = coflash(&[words, &["--board", "stm32f407g-disc1"]].concat()).good();
+        let said = done.out + &done.err;
+        assert!(said.contains("the program reaches into staging, from 080E0000h on"), "{said}");
+    }
 }
 
 /// A bus with a valid URL that does not exist.

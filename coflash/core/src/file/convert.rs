@@ -6,6 +6,7 @@ use super::block_file::{control_size, BlockFile, FRAMING, MAX_BLOCK_SIZE};
 use super::checksum::Checksum;
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Piece, Pieces};
+use super::judge;
 use super::label::label_of;
 use super::note::Note;
 use super::program::{Cut, LastBlock, Program, Release, Target, MAX_PROGRAM_SIZE};
@@ -319,7 +320,13 @@ fn place(image: Image, options: &Options) -> Result<(Image, u32, u64), ConvertEr
         Region::Strict(range) => {
             check_range(range)?;
             let image = adjusted(image)?;
-            image.check_inside(range)?;
+            image.check_inside(range).map_err(|error| match error.cause {
+                Cause::Outside { .. } => {
+                    let named = judge::named_image(&image, image.span().first);
+                    error.place.fault(named.map_or(error.cause, Cause::Judged))
+                }
+                _ => error,
+            })?;
             Ok((image, range.first, 0))
         }
         Region::Cut(range) => {

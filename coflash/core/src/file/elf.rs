@@ -95,6 +95,14 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
 fn header_of(bytes: &[u8]) -> Result<(&FileHeader32<Endianness>, Endianness), ReadError> {
     const CLASS: Place = Place::Offset(4);
     const DATA: Place = Place::Offset(5);
+    // It is at the same place in each class. The build for the computer is an ELF file, too.
+    let machine = bytes.get(18..20).map(|two| match bytes[5] {
+        2 => u16::from_be_bytes([two[0], two[1]]),
+        _ => u16::from_le_bytes([two[0], two[1]]),
+    });
+    if let Some(machine) = machine.filter(|machine| *machine != EM_ARM) {
+        return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
+    }
     match bytes {
         [0x7F, b'E', b'L', b'F', 1, 1, ..] => {}
         [0x7F, b'E', b'L', b'F', 1, _, ..] => {
@@ -108,10 +116,6 @@ fn header_of(bytes: &[u8]) -> Result<(&FileHeader32<Endianness>, Endianness), Re
     let header =
         FileHeader32::<Endianness>::parse(bytes).map_err(|_| cut_off(bytes, "the ELF header", 52))?;
     let endian = header.endian().map_err(|_| DATA.fault(Cause::WrongElf("has an unknown byte order")))?;
-    let machine = header.e_machine(endian);
-    if machine != EM_ARM {
-        return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
-    }
     let words = match header.e_type(endian) {
         ET_EXEC => None,
         ET_REL => Some("is not a linked program (it is an object file): give the linker's output"),
@@ -363,8 +367,10 @@ mod tests {
     fn refuses_what_the_device_cannot_run() {
         for (words, found) in [
             ("offset 0x4: is not a 32-bit ELF file", fault(|b| b[4] = 2)),
-            ("offset 0x5: is not little-endian", fault(|b| b[5] = 2)),
-            ("offset 0x12: is an ELF file for machine 62 and not for Arm", fault(|b| b[18] = 62)),
+            ("offset 0x5: is not little-endian", fault(|b| (b[5], b[18], b[19]) = (2, 0, 40))),
+            ("offset 0x12: is an ELF file for machine 243 (RISC-V) and not for Arm", fault(|b| b[18] = 243)),
+            // A test that was built for the computer (x86-64 psABI: EM_X86_64 is 62, of 64 bits).
+            ("offset 0x12: is an ELF file for machine 62 (x86", fault(|b| (b[4], b[18]) = (2, 62))),
             ("offset 0x10: is not a linked program (it is an object file)", fault(|b| b[16] = 1)),
             ("offset 0x10: is linked for no address", fault(|b| b[16] = 3)),
             ("offset 0x10: is not a linked program (it is a dump", fault(|b| b[16] = 4)),

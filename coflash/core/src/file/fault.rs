@@ -5,6 +5,8 @@ use std::fmt;
 use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
 use super::area::{Area, FLASH};
+use super::foreign::Foreign;
+use super::judge;
 use super::range::AddressRange;
 use crate::advice::Advice;
 
@@ -131,14 +133,9 @@ pub enum Cause {
         Advice::RawNeedsAddress
     )]
     NotFirmware,
-    /// A file of another kind, which its first bytes name.
-    #[error("is not a firmware file but {what}")]
-    Foreign {
-        /// The kind.
-        what: &'static str,
-        /// What to do.
-        advice: &'static str,
-    },
+    /// A file of another kind, which its first or last bytes name.
+    #[error("is not a firmware file but {}: {}", .0.what, .0.advice)]
+    Foreign(Foreign),
     /// A file whose first bytes are not those of the format that the user named.
     #[error("is no {named} file{}", .found.map_or(String::new(), |found| format!(", but {found}")))]
     NotNamedFormat {
@@ -238,6 +235,9 @@ pub enum Cause {
         /// The region of the program.
         region: AddressRange,
     },
+    /// Data outside the region, of an image that its contents name.
+    #[error("{}: {}", .0, .0.advice())]
+    Judged(judge::Fault),
     /// A program for another place of the same region: size and CRC count from its start.
     #[error("the program begins at {linked:#010x}, and the region at {start:#010x}: link the program for that address, or choose another board or program")]
     OtherPlace {
@@ -280,7 +280,7 @@ pub enum Cause {
     )]
     ProgramHeaderSize(u16),
     /// An ELF file for another machine.
-    #[error("is an ELF file for machine {0} and not for Arm (40)")]
+    #[error("is an ELF file for {} and not for Arm (40)", machine(*.0))]
     WrongMachine(u16),
     /// A wrong CRC of a block.
     #[error("CRC of block {number} is {found:#010x} and must be {needed:#010x}: the file is damaged")]
@@ -332,6 +332,8 @@ impl Cause {
             Self::Sealed => Advice::SealedStays,
             Self::NoAddress => Advice::GiveAddress,
             Self::TooSparse { .. } => Advice::SelectRange,
+            Self::Judged(fault) => fault.advice(),
+            Self::Foreign(foreign) => foreign.advice.clone(),
             Self::Elsewhere { area, .. } => area.advice(),
             _ => return None,
         })
@@ -363,7 +365,8 @@ impl Cause {
             | Self::NoRegularFile(_)
             | Self::TooLarge { .. }
             | Self::NotFirmware
-            | Self::Foreign { .. }
+            | Self::Foreign(_)
+            | Self::Judged(_)
             | Self::NotNamedFormat { .. }
             | Self::Encoding(_)
             | Self::Sealed
@@ -388,4 +391,16 @@ impl Cause {
             Self::NothingInside(_) => 0x6000_0024,
         }
     }
+}
+
+/// A machine of the ELF header (e_machine; the gABI's list), in words.
+fn machine(number: u16) -> String {
+    let name = match number {
+        3 | 62 => "x86, as for a test on the computer",
+        94 => "Xtensa",
+        183 => "64-bit Arm",
+        243 => "RISC-V",
+        _ => return format!("machine {number}"),
+    };
+    format!("machine {number} ({name})")
 }

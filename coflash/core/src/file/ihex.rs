@@ -1,6 +1,7 @@
 //! Intel HEX (Intel, "Hexadecimal Object File Format Specification", revision A, 1988).
 
 use super::fault::{Cause, Place, ReadError};
+use super::foreign::UNIVERSAL_HEX;
 use super::image::{Image, Pieces};
 use super::text::{bytes_of, check_length, lines};
 
@@ -38,6 +39,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
             // Start addresses: a device starts through its vector table, so these records are
             // checked and ignored.
             0x03 | 0x05 => expect_length(&data, 4, place)?,
+            0x0A..=0x0E => return Err(place.fault(Cause::Foreign(UNIVERSAL_HEX))),
             _ => return Err(place.fault(Cause::UnknownRecord(format!("{kind:02X}")))),
         }
     }
@@ -188,6 +190,12 @@ mod tests {
             (format!("{good}:0100010\u{e9}01FD\n"), "line 2: character 9 is not a hexadecimal digit"),
             (format!("{good}hello\n"), "line 2: the line does not begin with ':'"),
             (format!("{good}:00000006FA\n"), "line 2: unknown record type 06"),
+            // The block of a micro:bit (its specification, "Universal Hex", example of a block
+            // start).
+            (
+                format!("{good}:0400000A9903C0DEB8\n"),
+                "line 2: is not a firmware file but a universal HEX file",
+            ),
             (format!("{good}:0100000101FD\n"), "line 2: this record type has another length"),
             (format!("{good}:0100000401FA\n"), "line 2: this record type has another length"),
             (format!("{good}:00000001FF\n{good}"), "line 3: there is more text after the end record"),

@@ -11,6 +11,7 @@ use shared_abi::layout::Layout;
 use shared_abi::vectors::{Memory, VectorFault};
 
 use super::area::{Area, FLASH};
+use super::foreign::{self, Foreign};
 use super::image::Image;
 use super::range::AddressRange;
 use crate::advice::Advice;
@@ -37,6 +38,17 @@ pub enum Fault {
         range: AddressRange,
         /// Their area.
         area: Area,
+    },
+    /// It is an image of another kind, which its first bytes name.
+    #[error("is not a program but {}", .0.what)]
+    Foreign(Foreign),
+    /// It has a program, and other data before it: a factory file.
+    #[error("has more than a program: other data from {other:08X}h on, and a program at {program:08X}h")]
+    Merged {
+        /// The first address of the other data.
+        other: u32,
+        /// The address of the program's vectors.
+        program: u32,
     },
     /// It does not contain the first two vectors.
     #[error("is not a program: it does not begin with an initial stack pointer and a reset vector")]
@@ -94,9 +106,11 @@ impl Fault {
 
     /// What to do next.
     #[must_use]
-    pub const fn advice(&self) -> Advice {
+    pub fn advice(&self) -> Advice {
         match self {
             Self::Bootloader => Advice::BootloaderFile,
+            Self::Foreign(foreign) => foreign.advice.clone(),
+            Self::Merged { .. } => Advice::ProgramAlone,
             Self::Elsewhere { area, .. } => area.advice(),
             Self::OtherPlace { .. } => Advice::OtherPlace,
             Self::StackOverHandoff { .. } => Advice::StackOverHandoff,
@@ -113,6 +127,38 @@ impl Fault {
 /// # Errors
 /// The first fault.
 pub fn judge(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fault> {
+    judge_image(image, start, board).map_err(|fault| match fault {
+        Fault::Bootloader | Fault::NoVectors | Fault::StackPointer(_) => {
+            named_image(image, start).unwrap_or(fault)
+        }
+        fault => fault,
+    })
+}
+
+/// The fault of an image that does not begin with vectors, if its contents name one.
+pub(super) fn named_image(image: &Image, start: u32) -> Option<Fault> {
+    /// The room that Zephyr and imgtool leave for the header of MCUboot.
+    const HEADERS: [u32; 3] = [0x100, 0x200, 0x400];
+    let first = image.bytes::<8>(start).unwrap_or_default();
+    if let Some(foreign) = foreign::of_image(&first) {
+        return Some(Fault::Foreign(foreign));
+    }
+    let is_program = |at: &u32| is_begin(image, *at, &Memory::ANY);
+    if let Some(linked) = HEADERS.map(|room| start.saturating_add(room)).into_iter().find(is_program) {
+        return Some(Fault::OtherPlace { linked, start });
+    }
+    program_after(image, start).map(|program| Fault::Merged { other: start, program })
+}
+
+/// Where a program begins in an image with other data before it: the first sector after `first`
+/// that begins with a vector table.
+pub(super) fn program_after(image: &Image, first: u32) -> Option<u32> {
+    let step = FIRST_SECTOR.len() as u32;
+    let sectors = (first / step + 1..=image.span().last / step).map(|number| number * step);
+    sectors.filter(|at| FLASH.has(*at)).find(|at| is_begin(image, *at, &Memory::ANY))
+}
+
+fn judge_image(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fault> {
     let AddressRange { first, last } = image.span();
     if start == FLASH.first
         || image.part(AddressRange { first: FLASH.first, last: FLASH.first + 3 }).is_some()
@@ -269,6 +315,7 @@ mod tests {
     use shared_abi::layout::nucleo_f446re::LAYOUT as NUCLEO;
     use shared_abi::layout::stm32f429i_disc1::LAYOUT as F429;
 
+    use super::super::convert::{convert, Options, Region};
     use super::super::raw;
     use super::*;
 
@@ -448,6 +495,45 @@ mod tests {
         // Data without vectors are linked for nothing.
         let image = program(0x5A5A_5A5A, 0x0801_2189, 0x0801_2000);
         assert_eq!(judge(&image, START, None), Err(Fault::NoVectors));
+    }
+
+    /// The header of MCUboot: "MCUboot image format", `ih_magic`; Zephyr leaves 200h bytes for it.
+    #[test]
+    fn an_image_for_another_bootloader_is_named() {
+        let code = |at| program(0x2001_0000, at + 0x189, at).bytes::<0x400>(at).unwrap();
+        for (begin, words) in [
+            (&[0x3D, 0xB8, 0xF3, 0x96][..], "is not a program but an image for MCUboot"),
+            (b"PK\x03\x04", "is not a program but a zip archive"),
+            (&[], "is linked for 08010200h, and the program begins at 08010000h"),
+        ] {
+            let mut bytes = begin.to_vec();
+            bytes.resize(0x200, 0);
+            bytes.extend(code(START + 0x200));
+            let image = raw::read(&bytes, Some(START)).unwrap();
+            for board in [None, Some(&NUCLEO)] {
+                let fault = judge(&image, START, board).unwrap_err();
+                assert!(fault.to_string().starts_with(words), "{fault}");
+            }
+        }
+    }
+
+    /// A file of the production: other data, a gap or fill bytes, and the program.
+    #[test]
+    fn a_factory_file_is_named_with_the_place_of_its_program() {
+        for other in [0x0800_0000, 0x0800_C000] {
+            for fill in [0, 0xFF] {
+                let mut bytes = vec![fill; (START - other) as usize];
+                bytes[..8].copy_from_slice(b"CAL1\0\0\0\0");
+                bytes.extend(program(0x2001_0000, START + 0x189, START).bytes::<0x400>(START).unwrap());
+                let image = raw::read(&bytes, Some(other)).unwrap();
+                let fault = Fault::Merged { other, program: START };
+                assert_eq!(judge(&image, other, None), Err(fault));
+                // With the board, which says where the region of the program is.
+                let options = Options::default().region(Region::Strict(NUCLEO.programs[0].into()));
+                let error = convert(image, &options).unwrap_err();
+                assert!(error.to_string().ends_with(&format!("{fault}: {}", fault.advice())), "{error}");
+            }
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ pub use coboot_linker::board;
 pub mod convert;
 pub mod elf;
 pub mod fault;
-mod foreign;
+pub mod foreign;
 pub mod ihex;
 pub mod image;
 pub mod inspect;

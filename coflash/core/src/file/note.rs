@@ -2,8 +2,11 @@
 
 use std::fmt;
 
+use shared_abi::layout::Layout;
+
 use super::fault::Place;
 use super::range::AddressRange;
+use crate::advice::Advice;
 
 /// A warning about a firmware file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,6 +25,17 @@ pub enum Note {
     /// Data that run in RAM, of an ELF file without load addresses: nothing says where in the flash
     /// they are.
     NoLoadAddress(AddressRange),
+    /// The program covers flash from this address on that a new bootloader needs.
+    CoversStaging(u32),
+}
+
+impl Note {
+    /// The note about a program that ends at `last`, for this board.
+    #[must_use]
+    pub fn of_staging(last: u32, board: Option<&Layout>) -> Option<Self> {
+        let staging = board?.staging?;
+        (staging.base..staging.end()).contains(&last).then_some(Self::CoversStaging(staging.base))
+    }
 }
 
 impl fmt::Display for Note {
@@ -34,6 +48,12 @@ impl fmt::Display for Note {
                     count => write!(f, ", the first of {count} repetitions"),
                 }
             }
+            Self::CoversStaging(first) => write!(
+                f,
+                "the program reaches into staging, from {first:08X}h on, where a new bootloader waits: before the \
+                 bootloader can be renewed, the program has to be erased; {}",
+                Advice::EndBeforeStaging
+            ),
             Self::NoLoadAddress(range) => write!(
                 f,
                 "the data at {range} were left out: they are for the RAM, and no segment has a load address in the \

@@ -4,6 +4,7 @@ use shared_abi::ram_image::{Header, MAGIC};
 
 use super::checksum::CRC;
 use super::image::Image;
+use super::judge::program_after;
 use super::read::Firmware;
 
 /// The start of the flash.
@@ -16,6 +17,8 @@ const SECTOR: usize = 0x4000;
 pub struct RamImage {
     header: Header,
     bytes: Vec<u8>,
+    /// The address of a program in the same file.
+    program: Option<u32>,
 }
 
 /// Why a RAM image cannot be sent to a device.
@@ -24,6 +27,11 @@ pub enum Fault {
     /// It is for the bench: nobody has computed its CRC.
     #[error("is a bootloader without a CRC: build it by cargo xtask build, which writes the CRC")]
     Bench,
+    /// The file has a program, too: a factory file.
+    #[error(
+        "is a factory file with a bootloader and a program, at {0:08X}h, and an update writes one of them"
+    )]
+    Merged(u32),
     /// Its CRC is wrong.
     #[error("is a damaged bootloader: its header has the CRC {said:08X}h, and its bytes have {found:08X}h")]
     Crc {
@@ -38,7 +46,9 @@ impl Fault {
     /// The stable error number: that of a file that is not firmware.
     pub const NUMBER: u32 = super::judge::Fault::NUMBER;
     /// What to do next.
-    pub const ADVICE: &'static str = "give the bootloader.elf of a release, or of cargo xtask build";
+    pub const ADVICE: &'static str =
+        "to renew a bootloader give the bootloader.elf of a release, or of cargo xtask \
+        build; to update a program give the file of the program alone";
 }
 
 impl RamImage {
@@ -56,11 +66,12 @@ impl RamImage {
     /// program.
     #[must_use]
     pub fn find(image: &Image) -> Option<Self> {
-        image.segments().find_map(|(address, data)| match address {
+        let found = image.segments().find_map(|(address, data)| match address {
             // The resident part precedes it; it begins with a sector.
             0 | FLASH => data.chunks(SECTOR).enumerate().find_map(|(at, _)| Self::at(&data[at * SECTOR..])),
             _ => Self::at(&data),
-        })
+        })?;
+        Some(Self { program: program_after(image, image.span().first), ..found })
     }
 
     /// The RAM image at the start of these bytes.
@@ -71,7 +82,7 @@ impl RamImage {
             && header.size.is_multiple_of(4)
             && header.size > 0;
         let bytes = data.get(..header.total() as usize).filter(|_| is_possible)?.to_vec();
-        Some(Self { header, bytes })
+        Some(Self { header, bytes, program: None })
     }
 
     /// Its header.
@@ -86,15 +97,16 @@ impl RamImage {
         &self.bytes
     }
 
-    /// Checks the CRC, as each device does.
+    /// Checks that the file has nothing else to write, and the CRC, as each device does.
     ///
     /// # Errors
     /// [`Fault`].
     pub fn check(&self) -> Result<(), Fault> {
         let (said, found) = (self.header.crc, CRC.checksum(&self.bytes[Header::CRC_FROM as usize..]));
-        match said {
-            0 => Err(Fault::Bench),
-            said if said != found => Err(Fault::Crc { said, found }),
+        match (self.program, said) {
+            (Some(program), _) => Err(Fault::Merged(program)),
+            (None, 0) => Err(Fault::Bench),
+            (None, said) if said != found => Err(Fault::Crc { said, found }),
             _ => Ok(()),
         }
     }
@@ -159,6 +171,17 @@ mod tests {
             };
             assert_eq!(RamImage::find(&image), None);
         }
+    }
+
+    /// It would renew the bootloader, and leave the program out.
+    #[test]
+    fn a_factory_file_is_refused() {
+        let mut file = vec![0xA5; 0x1_0000];
+        file.extend(with_crc(made(128)));
+        file.resize(0x2_0000, 0xFF);
+        file.extend([0x2001_FFC0_u32, 0x0802_0009, 0].into_iter().flat_map(u32::to_le_bytes));
+        let fault = found(&file).unwrap().check().unwrap_err();
+        assert!(fault.to_string().contains("a bootloader and a program, at 08020000h"), "{fault}");
     }
 
     #[test]

@@ -135,10 +135,11 @@ fn read_telling(
             return Err(Place::File.fault(Cause::Encoding(encoding)));
         }
     }
-    let other = |otherwise| match foreign::name(bytes) {
-        Some((what, advice)) => Place::File.fault(Cause::Foreign { what, advice }),
-        None => Place::File.fault(otherwise),
-    };
+    let other = |otherwise| Place::File.fault(foreign::name(bytes).map_or(otherwise, Cause::Foreign));
+    // What follows the segments of an ELF file does no harm.
+    if let Some(foreign) = foreign::by_end(bytes).filter(|_| found != Some(Format::Elf)) {
+        return Err(other(Cause::Foreign(foreign)));
+    }
     let format = format.ok_or_else(|| other(Cause::NotFirmware))?;
     // A text with a damaged first line has another fault than a file that is none of the kind, so
     // only the first character counts.

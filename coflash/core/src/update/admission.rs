@@ -9,11 +9,13 @@ use shared_abi::layout;
 use super::dialect::is_data;
 use super::options::FlashOptions;
 use super::payload::{refusal_number, Payload};
+use super::phase::Warning;
 use super::steps::compare_target;
 use crate::advice::Advice;
 use crate::device::access::{challenge, security_of, takes_open, Challenge};
 use crate::device::error::{reported, Error, IdentityPart};
 use crate::device::region::program_region;
+use crate::device::renewal;
 use crate::device::{Dialect, Form, Session};
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
 use crate::file::sealed::{Refusal, SealedFile};
@@ -189,6 +191,26 @@ fn admit_size(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool,
         }
         Some(_) => Ok(true),
     }
+}
+
+/// Whether the content reaches into staging: the last sector of the last program, of 128 KiB on
+/// each chip that has it, in a device that can renew its bootloader. No program begins there.
+pub(super) fn covers_staging(
+    session: &mut Session<'_>,
+    file: &Payload,
+    program: u8,
+) -> Result<Option<Warning>, Error> {
+    const STAGING: u32 = 128 * 1024;
+    if file.is_bootloader() || file.size() <= STAGING {
+        return Ok(None);
+    }
+    let Some(region) = program_region(session, program)?.filter(|it| it.size > STAGING) else {
+        return Ok(None);
+    };
+    // The bootloader has the number after the last program.
+    let is_last = renewal::number(session)?.and_then(|number| number.checked_sub(1)) == Some(program);
+    let first = region.last() - (STAGING - 1);
+    Ok((is_last && file.size() > first - region.base).then_some(Warning::CoversStaging { first }))
 }
 
 fn refused(refusal: &Refusal) -> Error {

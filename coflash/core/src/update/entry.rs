@@ -1,6 +1,6 @@
 //! Step 3: the way of a device into its bootloader.
 
-use super::admission::Admission;
+use super::admission::{covers_staging, Admission};
 use super::dialect::renew::Renew;
 use super::dialect::{self, Procedure};
 use super::event::Phase;
@@ -47,7 +47,11 @@ pub(super) fn enter(
             start_again(session, program, update);
         }
     }
-    is_ready
+    is_ready?;
+    if let Some(warning) = covers_staging(session, file, update.options.program)? {
+        update.report(warning.into());
+    }
+    Ok(())
 }
 
 /// Starts the program again that was called back for an update which does not take place. The reason

@@ -12,7 +12,7 @@ use crate::device::info::Nameplate;
 use crate::device::session::Silence;
 use crate::device::{DeviceType, Dialect};
 use crate::file::checksum::Checksum;
-use crate::file::Target;
+use crate::file::{self, Target};
 use crate::json;
 use shared_abi::ram_image::Version;
 
@@ -180,6 +180,12 @@ pub enum Warning {
         /// What the device found.
         why: String,
     },
+    /// The program covers the flash that a new bootloader needs.
+    CoversStaging {
+        /// First address of that flash.
+        #[serde(serialize_with = "json::hex")]
+        first: u32,
+    },
     /// The device has not answered for a while, and the tool waits for it.
     Silent(Silence),
     /// The adapter has refused frames, or has restarted.
@@ -286,6 +292,7 @@ impl fmt::Display for Warning {
             Self::BeginsAgain { why } => {
                 write!(f, "what the device had of this program is not usable ({why}): sending everything")
             }
+            Self::CoversStaging { first } => file::Note::CoversStaging(*first).fmt(f),
             Self::Silent(silence) => silence.fmt(f),
             Self::Adapter { refused, restarts } => {
                 Losses { refused: *refused, restarts: *restarts, lost: 0 }.fmt(f)

@@ -7,6 +7,7 @@ use coflash_core::device::info::info;
 use coflash_core::device::{Dialect, Doing, Error, Session, Timing};
 use coflash_core::file::convert::{program_of, Label as Told, Options};
 use coflash_core::file::{raw, Firmware, Program};
+use coflash_core::update::event::Warning;
 use coflash_core::update::{DeviceState, Event, FlashOptions, Password, Report};
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
@@ -221,7 +222,13 @@ struct Told2004 {
 
 impl Maker for Told2004 {
     fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
-        (at == (0x2004, 1) && self.while_running.contains(&running)).then(|| Ok(self.value.clone()))
+        let (value, bootloader) = self.value.split_at(8);
+        match at {
+            (0x2004, 1) if self.while_running.contains(&running) => Some(Ok(value.to_vec())),
+            // A device that can be renewed has a number for its bootloader.
+            (0x2007, 1) if !bootloader.is_empty() => Some(Ok(bootloader.to_vec())),
+            _ => None,
+        }
     }
 
     fn write(&mut self, at: (u16, u8), data: &[u8], _: u32) -> Option<Result<Deed, u32>> {
@@ -271,6 +278,39 @@ fn what_is_for_another_place_than_the_devices_is_refused() {
     run(&mut at(START + 0x1_0000, 1024, APPLICATION, &BOTH), &file, FlashOptions::default().force(true))
         .0
         .unwrap();
+}
+
+/// A checksum at the end of the region, as srec_cat puts it there: the last sector of the last
+/// program is for a new bootloader (RM0090 table 5: sector 11 of an STM32F407, 128 KiB from
+/// 080E_0000h on).
+#[test]
+fn a_program_that_covers_staging_is_written_with_a_warning() {
+    const BEGIN: u32 = 0x0802_0000;
+    let with_checksum = |at: u32| {
+        let mut bytes = vec![0x5A; 1024];
+        bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+        bytes[4..8].copy_from_slice(&(BEGIN + 0x201).to_le_bytes());
+        bytes.resize((at + 4 - BEGIN) as usize, 0xFF);
+        file(&bytes, BEGIN, Told::default())
+    };
+    for (checksum, bootloader, warned) in [
+        (0x080F_FFFC, vec![2], true),
+        (0x080E_0000, vec![2], true),
+        (0x080D_FFFC, vec![2], false),
+        (0x080F_FFFC, vec![3], false), // program 2 is the last one
+        (0x080F_FFFC, vec![0], false), // no renewal
+        (0x080F_FFFC, vec![], false),
+    ] {
+        let mut fake = Fake::new(APPLICATION);
+        let region = [BEGIN, 0xE_0000].into_iter().flat_map(u32::to_le_bytes);
+        let value = region.chain(bootloader.clone()).collect();
+        fake.maker = Some(Box::new(Told2004 { while_running: vec![BOOTLOADER], value }));
+        let (result, events) = run(&mut fake, &with_checksum(checksum), FlashOptions::default());
+        result.unwrap();
+        let warning = Event::from(Warning::CoversStaging { first: 0x080E_0000 });
+        let count = events.iter().filter(|event| **event == warning).count();
+        assert_eq!(count, usize::from(warned), "{checksum:08X}h, bootloader {bootloader:?}");
+    }
 }
 
 /// An application of another manufacturer does not have this object: the bootloader is asked before

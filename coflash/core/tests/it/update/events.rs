@@ -160,6 +160,12 @@ fn the_names_stay() {
         ("warning", "master_missing", Warning::MasterMissing.into(), json!({})),
         (
             "warning",
+            "covers_staging",
+            Warning::CoversStaging { first: 0x080E_0000 }.into(),
+            json!({ "first": "0x080e0000" }),
+        ),
+        (
+            "warning",
             "silent",
             Warning::Silent(Silence { doing: Doing::Restart, silent: seconds, limit: seconds }).into(),
             json!({ "doing": "restarting the program", "seconds": 1.235, "limit_seconds": 1.235 }),
