@@ -14,7 +14,8 @@ fn main() {
     let has = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
     let template = if has("RESIDENT") { "resident.x" } else { "bootloader.x" };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
-    coboot_linker::write_memory(layout, Image::Bootloader, &out).unwrap_or_else(|error| panic!("{error}"));
+    coboot_linker::write_memory(layout.linker_script(Image::Bootloader), &out)
+        .unwrap_or_else(|error| panic!("{error}"));
     assert!(
         layout.home.is_some() || !has("SEALED"),
         "{} has the compact map, which has no key block: sealed images need a split one (docs/porting.md)",
@@ -30,7 +31,7 @@ fn main() {
     println!("cargo:rerun-if-changed={}", templates.display());
     println!("cargo:rustc-link-search={}", templates.display());
     let product = product(&package, &out);
-    coboot_linker::link(&out, template);
+    coboot_linker::link(&out, &[template]);
     // Functions with identical code are merged.
     println!("cargo:rustc-link-arg-bins=--icf=all");
     if template == "bootloader.x" && has("LOG_DEFMT") {

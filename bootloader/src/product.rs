@@ -143,7 +143,7 @@ impl Product {
             "product: download.crc_step must be 65536 bytes or less: the watchdog waits for a step"
         );
         assert!(
-            block_buffer >= 1024 && block_buffer < LAYOUT.ram.size as usize,
+            block_buffer >= 1024 && block_buffer < LAYOUT.bootloader_ram().size as usize,
             "product: download.block_buffer must be 1024 bytes or more, and fit the RAM"
         );
         if let Some(ms) = self.watchdog.bootloader_ms {

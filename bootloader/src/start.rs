@@ -85,7 +85,7 @@ global_asm!(
     magic = const ram_image::MAGIC,
     length = const Header::SIZE,
     ram_base = const LAYOUT.ram.base,
-    ram_end = const LAYOUT.ram.end(),
+    ram_end = const LAYOUT.bootloader_ram().end(),
     services = const ram_image::SERVICES_VERSION,
     features = const ABILITIES.0,
     board = const BOARD_IDENTITY,

@@ -6,12 +6,13 @@
 //! coboot_linker::Application::of_board("stm32f407g-disc1").emit();
 //! ```
 //!
-//! [`Application::emit`] writes three files into `OUT_DIR` and makes cargo link with them:
+//! [`Application::emit`] writes four files into `OUT_DIR` and makes cargo link with them:
 //!
 //! | file | what it is |
 //! |---|---|
 //! | `memory.x` | `MEMORY` and the border symbols of the board |
-//! | `application.x` | includes the `link.x` of cortex-m-rt, places the label, checks the borders |
+//! | `label.x` | places the label |
+//! | `application.x` | includes the `link.x` of cortex-m-rt, checks the borders |
 //! | `coboot_layout.rs` | the memory map as a Rust expression, for `coboot_app::layout!()` |
 //!
 //! `board` reads a memory map from a file, for host tools too (feature `file`, on by default).
@@ -24,7 +25,7 @@ mod rust;
 use std::path::{Path, PathBuf};
 use std::{env, fmt, fs};
 
-use shared_abi::layout::{self, Image, Layout, BOARDS};
+use shared_abi::layout::{self, Image, Layout, LinkerScript, BOARDS};
 
 /// Why the helper cannot prepare an application.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -87,6 +88,8 @@ impl Error {
 pub const LAYOUT_FILE: &str = "coboot_layout.rs";
 /// The linker script of an application.
 const TEMPLATE: &str = include_str!("../application.x");
+/// The part of it that is read first.
+const LABEL: &str = include_str!("../label.x");
 
 /// An application and the source of its memory map.
 #[derive(Clone, Debug)]
@@ -97,12 +100,13 @@ pub struct Application {
     file: Option<PathBuf>,
     program: u8,
     over_staging: bool,
+    keeps_ram: bool,
 }
 
 impl Application {
     /// For a board with this memory map.
     pub const fn new(layout: &'static Layout) -> Self {
-        Self { layout: Ok(layout), file: None, program: 1, over_staging: false }
+        Self { layout: Ok(layout), file: None, program: 1, over_staging: false, keeps_ram: false }
     }
 
     /// For a board of the coboot repository, by its name.
@@ -140,6 +144,14 @@ impl Application {
         self
     }
 
+    /// Ends the RAM of the program before the last KiB, which the bootloader leaves alone
+    /// ([`Layout::kept`]): a crash log there outlives each reset but that of the power.
+    /// `panic-persist` finds it by its symbols.
+    pub const fn keeping_ram(mut self) -> Self {
+        self.keeps_ram = true;
+        self
+    }
+
     /// Writes the files into `OUT_DIR` and makes cargo link with them. An error ends the build
     /// with a message that gives the reason.
     pub fn emit(self) {
@@ -160,7 +172,7 @@ impl Application {
         }
         self.write(&out)?;
         println!("cargo::rerun-if-changed=build.rs");
-        link(&out, "application.x");
+        link(&out, &["label.x", "application.x"]);
         Ok(())
     }
 
@@ -181,10 +193,13 @@ impl Application {
             true => Image::WholeProgram(self.program),
             false => Image::Program(self.program),
         };
-        write_memory(layout, image, folder)?;
-        for (name, text) in
-            [("application.x", TEMPLATE.to_owned()), (LAYOUT_FILE, rust::Expression(layout).to_string())]
-        {
+        let script = layout.linker_script(image);
+        write_memory(if self.keeps_ram { script.keeping_ram() } else { script }, folder)?;
+        for (name, text) in [
+            ("label.x", LABEL.to_owned()),
+            ("application.x", TEMPLATE.to_owned()),
+            (LAYOUT_FILE, rust::Expression(layout).to_string()),
+        ] {
             write(&folder.join(name), &text)?;
         }
         Ok(())
@@ -208,19 +223,27 @@ pub fn chosen_board() -> Result<&'static Layout, Error> {
 ///
 /// # Errors
 /// [`Error::File`].
-pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), Error> {
-    write(&folder.join("memory.x"), &layout.linker_script(image).to_string())
+pub fn write_memory(script: LinkerScript<'_>, folder: &Path) -> Result<(), Error> {
+    write(&folder.join("memory.x"), &script.to_string())
 }
 
-/// Makes cargo link the binaries of this package with `script`, which is in `folder` together
-/// with the files that it includes.
-pub fn link(folder: &Path, script: &str) {
-    // Not `rustc-link-search`: packages that depend on this one would find its files, too.
-    println!("cargo::rustc-link-arg-bins=-L{}", folder.display());
-    println!("cargo::rustc-link-arg-bins=-T{script}");
-    // Without it the linker aligns segments to pages of 64 KiB, and the file claims more flash than
-    // the program fills.
-    println!("cargo::rustc-link-arg-bins=--nmagic");
+/// Makes cargo link the binaries of this package with `scripts`, which are in `folder` together
+/// with the files that they include.
+pub fn link(folder: &Path, scripts: &[&str]) {
+    for argument in arguments(folder, scripts) {
+        println!("cargo::rustc-link-arg-bins={argument}");
+    }
+}
+
+/// The arguments, in the forms that LLD, GNU ld, gcc as a linker and flip-link all know: flip-link
+/// 0.1.12 finds a folder only in an argument of its own after `-L`, and gcc hands on `-n`, but not
+/// `--nmagic`.
+fn arguments(folder: &Path, scripts: &[&str]) -> Vec<String> {
+    // Not `rustc-link-search`: packages that depend on this one would find its files, too. Without
+    // `-n` the linker aligns segments to pages of 64 KiB, and the file claims more flash than the
+    // program fills.
+    let folder = ["-n".into(), "-L".into(), folder.display().to_string()];
+    folder.into_iter().chain(scripts.iter().map(|script| format!("-T{script}"))).collect()
 }
 
 fn write(path: &Path, text: &str) -> Result<(), Error> {
@@ -257,6 +280,14 @@ mod tests {
         assert!(whole.contains("FLASH : ORIGIN = 0x08080000, LENGTH = 0x80000"), "{whole}");
         assert!(fs::read_to_string(folder.join("application.x")).unwrap().contains("INCLUDE link.x"));
         fs::remove_dir_all(folder).unwrap();
+    }
+
+    /// As the parser of flip-link 0.1.12 reads them (`argument_parser.rs`): pairs for `-L`, one for
+    /// `-T`.
+    #[test]
+    fn the_linkers_of_others_understand_the_arguments() {
+        let arguments = arguments(Path::new("/out"), &["label.x", "application.x"]);
+        assert_eq!(arguments, ["-n", "-L", "/out", "-Tlabel.x", "-Tapplication.x"]);
     }
 
     #[test]

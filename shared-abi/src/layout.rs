@@ -32,6 +32,12 @@ pub const KEY_BLOCK_SIZE: u32 = 256;
 /// boot stage, which copies the RAM image, uses the same RAM.
 pub const LEAST_STACK: u32 = 4096;
 
+/// The size of [`Layout::kept`] in bytes, on a chip that has it to spare.
+const KEPT: u32 = 1024;
+/// The least SRAM of such a chip: beside the largest RAM image and its stack it has room for the
+/// default queue.
+const KEEPS_FROM: u32 = 128 * 1024;
+
 /// The offset of a word in the bootloader's vector table that is not a vector (PM0214 section
 /// 2.3.4: reserved). It contains [`KNOWS_SEALED_IMAGES`] in a bootloader that uses a key block.
 pub const MARK_OFFSET: u32 = 0x1C;
@@ -91,7 +97,8 @@ pub struct Layout {
     /// Flash for a new RAM image of the bootloader: the last sector of the last program, and never
     /// its only one.
     pub staging: Option<Region>,
-    /// RAM for code and data. Bootloader and application each use all of it.
+    /// RAM for code and data. The application uses all of it, the bootloader all but
+    /// [`Self::kept`].
     pub ram: Region,
     /// The place of the [`handoff`].
     pub handoff: Region,
@@ -263,6 +270,21 @@ impl Layout {
         self.bootloader.base + self.callgate_offset
     }
 
+    /// The end of the RAM, which the bootloader leaves alone: an application finds there after each
+    /// reset but that of the power what it wrote before. Empty on a chip with less than 128 KiB.
+    #[must_use]
+    pub const fn kept(&self) -> Region {
+        let size = if self.chip.sram.size >= KEEPS_FROM && self.ram.size > KEPT { KEPT } else { 0 };
+        Region::new(self.ram.end() - size, size)
+    }
+
+    /// The RAM of the bootloader: of its resident part, which uses the end as its stack, and of its
+    /// RAM image.
+    #[must_use]
+    pub const fn bootloader_ram(&self) -> Region {
+        Region::new(self.ram.base, self.ram.size - self.kept().size)
+    }
+
     /// The keys of a sealed device: the last [`KEY_BLOCK_SIZE`] bytes of the resident part's flash,
     /// written in production and never by the bootloader. Only the split map has sealed images.
     #[must_use]
@@ -315,7 +337,8 @@ impl Layout {
     /// The linker script of this layout, which `build.rs` writes to `layout.x`.
     #[must_use]
     pub const fn linker_script(&self, image: Image) -> LinkerScript<'_> {
-        LinkerScript { layout: self, image }
+        let keeps_ram = matches!(image, Image::Bootloader);
+        LinkerScript { layout: self, image, keeps_ram }
     }
 }
 
@@ -377,6 +400,15 @@ pub enum Image {
 pub struct LinkerScript<'a> {
     layout: &'a Layout,
     image: Image,
+    keeps_ram: bool,
+}
+
+impl LinkerScript<'_> {
+    /// Ends the RAM of a program before [`Layout::kept`], and names that for `panic-persist`.
+    #[must_use]
+    pub const fn keeping_ram(self) -> Self {
+        Self { keeps_ram: true, ..self }
+    }
 }
 
 impl fmt::Display for LinkerScript<'_> {
@@ -394,7 +426,8 @@ impl fmt::Display for LinkerScript<'_> {
         )?;
         writeln!(f, "MEMORY\n{{")?;
         let home = layout.home.filter(|_| self.image == Image::Bootloader);
-        let memories = [("FLASH", Some(flash)), ("HOME ", home), ("RAM  ", Some(layout.ram))];
+        let (kept, ram) = (layout.kept(), if self.keeps_ram { layout.bootloader_ram() } else { layout.ram });
+        let memories = [("FLASH", Some(flash)), ("HOME ", home), ("RAM  ", Some(ram))];
         for (name, region) in memories {
             if let Some(Region { base, size }) = region {
                 writeln!(f, "  {name} : ORIGIN = {base:#010x}, LENGTH = {size:#x}")?;
@@ -417,12 +450,17 @@ impl fmt::Display for LinkerScript<'_> {
             ("__label_end", flash.base + label::OFFSET + label::SIZE as u32),
             ("__callgate_table", layout.callgate()),
             ("__callgate_table_size", callgate::TABLE_SIZE),
+            ("__kept", kept.base),
+            ("__kept_end", kept.end()),
             ("__handoff", layout.handoff.base),
             ("__warm_start", layout.warm_start.base),
             ("__sram_end", layout.chip.sram.end()),
             ("__programs", layout.programs.len() as u32),
         ] {
             writeln!(f, "{symbol} = {value:#010x};")?;
+        }
+        if self.keeps_ram && self.image != Image::Bootloader {
+            writeln!(f, "_panic_dump_start = __kept;\n_panic_dump_end = __kept_end;")?;
         }
         Ok(())
     }

@@ -114,7 +114,7 @@ fn the_header_says_what_was_linked() {
         assert_eq!(parts.get(CRC), parts.right_crc(), "{name}");
         assert_eq!(parts.get(LENGTH), 64);
         assert_eq!(parts.get(SIZE) as usize, parts.ram().len());
-        assert_eq!([parts.get(RAM_BASE), parts.get(RAM_END)], [board.ram.base, board.ram.end()]);
+        assert_eq!([parts.get(RAM_BASE), parts.get(RAM_END)], [board.ram.base, board.bootloader_ram().end()]);
         let renews = board.staging.is_some() && name == firmware::BOOTLOADER;
         assert_eq!(
             [parts.get(SERVICES), parts.get(FEATURES)],
@@ -161,7 +161,7 @@ fn vectors() {
     let parts = Parts::of(firmware::BOOTLOADER);
     let in_flash = words(&parts.resident[..64]);
     assert_eq!(parts.resident[64..68], *b"CBCG", "the callgate follows them");
-    assert_eq!(in_flash[0], board.ram.end());
+    assert_eq!(in_flash[0], board.bootloader_ram().end());
     for vector in &in_flash[1..] {
         assert!(vector & 1 == 1 && board.bootloader.contains(vector & !1, 2), "{vector:#x}");
     }
@@ -280,6 +280,7 @@ const BY_FACTS: u32 = 6;
 /// Ways to damage an image, and the boot stage's report.
 fn damages() -> Vec<(&'static str, Parts, u32)> {
     let board = firmware::board();
+    let ram = board.bootloader_ram();
     let good = Parts::of(firmware::BOOTLOADER);
     let size = good.get(SIZE);
     let damaged = |words: &[(usize, u32)]| {
@@ -308,12 +309,12 @@ fn damages() -> Vec<(&'static str, Parts, u32)> {
         ("another format", sealed(&[(LENGTH, 64 | 1 << 16)]), BY_HEADER),
         ("more bytes than flash", damaged(&[(SIZE, 0x1_0000)]), BY_HEADER),
         ("as many as there can be", damaged(&[(SIZE, !3)]), BY_HEADER),
-        ("more bytes than RAM", damaged(&[(SIZE, board.ram.size - 4092)]), BY_HEADER),
+        ("more bytes than RAM", damaged(&[(SIZE, ram.size - 4092)]), BY_HEADER),
         ("no bytes", sealed(&[(SIZE, 0)]), BY_HEADER),
         ("a half word", sealed(&[(SIZE, size - 2)]), BY_HEADER),
         ("another place in RAM", sealed(&[(RAM_BASE, board.ram.base + 0x200)]), BY_HEADER),
         ("a place in flash", sealed(&[(RAM_BASE, good.home)]), BY_HEADER),
-        ("RAM of the handoff", sealed(&[(RAM_END, board.ram.end() + 4)]), BY_HEADER),
+        ("RAM that is kept", sealed(&[(RAM_END, ram.end() + 4)]), BY_HEADER),
         ("RAM that ends before it begins", sealed(&[(RAM_END, 0)]), BY_HEADER),
         ("RAM that is shorter than the image", sealed(&[(RAM_END, board.ram.base + size - 4)]), BY_HEADER),
         ("newer services", sealed(&[(SERVICES, SERVICES_VERSION + 1)]), BY_SERVICES),
@@ -326,8 +327,8 @@ fn damages() -> Vec<(&'static str, Parts, u32)> {
         ("a word less", damaged(&[(SIZE, size - 4)]), BY_CRC),
         ("the first bit", bit(HEADER), BY_CRC),
         ("the last bit", bit(last), BY_CRC),
-        ("a stack over the end of the RAM", sealed(&[(STACK, board.ram.end() + 8)]), BY_VECTORS),
-        ("an uneven stack", sealed(&[(STACK, board.ram.end() - 4)]), BY_VECTORS),
+        ("a stack over the end of the RAM", sealed(&[(STACK, ram.end() + 8)]), BY_VECTORS),
+        ("an uneven stack", sealed(&[(STACK, ram.end() - 4)]), BY_VECTORS),
         ("a stack in flash", sealed(&[(STACK, good.home + 8)]), BY_VECTORS),
         ("a Reset in flash", sealed(&[(RESET, good.home + 0x201)]), BY_VECTORS),
         ("a Reset in the vectors", sealed(&[(RESET, board.ram.base + 1)]), BY_VECTORS),

@@ -21,7 +21,7 @@ fn the_boot_stage_stays_within_its_stack() {
         }
         bench.power_off();
         bench.power_on();
-        let all = Region::new(board.ram.end() - 4 * LEAST_STACK, 4 * LEAST_STACK);
+        let all = Region::new(board.bootloader_ram().end() - 4 * LEAST_STACK, 4 * LEAST_STACK);
         stack::fill(bench.machine(), all);
         let next = if is_installed { board.programs[0] } else { board.ram };
         while !next.contains(bench.machine().pc(), 2) {

@@ -59,6 +59,18 @@ fn a_project_of_the_template_is_installed_and_updates_itself() {
     }
 }
 
+/// flip-link puts the variables at the end of the RAM, and the stack below them (its README).
+#[test]
+#[ignore = "needs the image that `cargo xtask examples flip-link` builds"]
+fn a_program_of_flip_link_is_installed_and_updates_itself() {
+    if is_board_of_examples() {
+        let stack =
+            firmware::raw("example-flip-link.elf").first_chunk().map(|word| u32::from_le_bytes(*word));
+        assert!(stack < Some(firmware::board().ram.end()), "{stack:x?}");
+        install_and_update(["example-flip-link.elf", "example-no-stack-v2.elf"]);
+    }
+}
+
 fn install_and_update(versions: [&str; 2]) {
     let mut endpoint = Endpoint::new(Bench::new().switched_on());
     let url = endpoint.url();

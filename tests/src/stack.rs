@@ -19,7 +19,7 @@ const ALLOC: u64 = 2;
 pub fn of_image(image: &str) -> Region {
     let elf = firmware::elf(image);
     let file = ElfFile32::<Endianness>::parse(&*elf).expect("an ELF file");
-    let ram = firmware::board().ram;
+    let ram = firmware::board().bootloader_ram();
     let ends = file.sections().filter_map(|section| {
         let takes_memory = matches!(section.flags(), SectionFlags::Elf { sh_flags } if sh_flags & ALLOC != 0);
         takes_memory.then_some((section.address() + section.size()) as u32)

@@ -16,9 +16,9 @@ usage: cargo xtask examples [NAME...]
 
 Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
 target/firmware/stm32f407g-disc1/example-NAME.elf. A NAME is a folder of examples/, or with -v2 the same
-program as version 2 (c-v2 and cpp-v2 by clang). Without a NAME it builds all of them, but not `template`:
-a new project, which `cargo generate` makes of no-stack. cargo-generate is built first, which takes some
-minutes once.
+program as version 2 (c-v2 and cpp-v2 by clang). Without a NAME it builds all of them, but not these two,
+whose tools are built first, which takes some minutes once: `template`, a new project, which `cargo generate`
+makes of no-stack, and `flip-link`, which is no-stack linked by flip-link.
 ";
 
 /// The board of all examples: their pages name it.
@@ -37,10 +37,12 @@ const EXAMPLES: [(&str, Option<&str>); 5] = [
 const TEMPLATE: &str = "template";
 /// The version of cargo-generate, which makes a project of a template.
 const GENERATE: &str = "0.23.7";
+/// The linker that puts the stack below the variables, and its version.
+const FLIP_LINK: (&str, &str) = ("flip-link", "0.1.12");
 
 pub fn run(args: Args) -> Outcome {
     let chosen = args.remaining();
-    let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
+    let known: Vec<String> = names().chain([TEMPLATE.to_owned(), FLIP_LINK.0.to_owned()]).collect();
     if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
         return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));
     }
@@ -70,7 +72,20 @@ fn build(name: &str) -> Outcome {
             let (toolchain, version) = if is_second { ("clang", 2) } else { ("arm-none-eabi-gcc", 1) };
             by_cmake(&folder, &work.join(name), toolchain, &[format!("VERSION={version}")])?
         }
-        Some((_, Some(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
+        Some((_, Some(program))) => {
+            by_cargo(&folder, &work.join("rust"), program, is_second.then_some("--features=version-2"))?
+        }
+        None if name == FLIP_LINK.0 => {
+            let linker = setup::tool(FLIP_LINK.0, FLIP_LINK.1, &[])?;
+            let linker =
+                format!("--config=target.{}.linker={:?}", workspace::TARGET, linker.display().to_string());
+            by_cargo(
+                &workspace::root().join("examples/no-stack"),
+                &work.join("rust"),
+                "no-stack",
+                Some(&linker),
+            )?
+        }
         None => template(&workspace::root().join("examples/no-stack"), &work)?,
     };
     let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", name));
@@ -79,9 +94,9 @@ fn build(name: &str) -> Outcome {
 }
 
 /// Builds a package; returns the program. All packages share `work`, and so their dependencies.
-fn by_cargo(folder: &Path, work: &Path, program: &str, is_second: bool) -> Outcome<PathBuf> {
+fn by_cargo(folder: &Path, work: &Path, program: &str, option: Option<&str>) -> Outcome<PathBuf> {
     let mut cargo = process::cargo_on(folder, "build --locked --release --target-dir");
-    cargo.arg(work).args(is_second.then_some("--features=version-2"));
+    cargo.arg(work).args(option);
     // Cargo looks for the folder's own settings from its current folder.
     process::output(cargo.current_dir(folder))?;
     Ok(work.join(workspace::TARGET).join("release").join(program))

@@ -72,8 +72,8 @@ pub unsafe fn check(flash: &ResidentFlash, place: Region) -> Result<VectorTable,
 
 /// Copies the image in a place to its RAM.
 ///
-/// # Safety
-/// [`check`] has found it good. Nothing may use the RAM except its last [`LEAST_STACK`] bytes.
+/// # Safety [`check`] has found it good. Nothing may use the RAM of the bootloader except its last
+/// [`LEAST_STACK`] bytes.
 pub unsafe fn copy(place: Region) {
     // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the
     // stack its room, and has a multiple of four bytes; both addresses are aligned. The caller
@@ -88,20 +88,22 @@ pub unsafe fn copy(place: Region) {
     }
 }
 
-/// Removes the secrets that the RAM image may have left, wherever a reset has ended it: clears all of the RAM but
-/// the last [`LEAST_STACK`] bytes, which Reset has cleared. The RAM of a program that has run since stays as it
-/// is: the handoff, which the report of a RAM image replaces, says which of them it was. 0.3 ms.
+/// Removes the secrets that the RAM image may have left, wherever a reset has ended it: clears all
+/// of its RAM but the last [`LEAST_STACK`] bytes, which Reset has cleared. The RAM of a program
+/// that has run since stays as it is: the handoff, which the report of a RAM image replaces, says
+/// which of them it was. 0.3 ms.
 ///
 /// # Safety
-/// Nothing may use the RAM except its last [`LEAST_STACK`] bytes.
+/// Nothing may use the RAM of the bootloader except its last [`LEAST_STACK`] bytes.
 pub unsafe fn wipe() {
     // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
     if unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) } != 0 {
         return;
     }
-    const { assert!(LAYOUT.ram.size > LEAST_STACK && LAYOUT.ram.size.is_multiple_of(64)) };
+    const RAM: Region = LAYOUT.bootloader_ram();
+    const { assert!(RAM.size > LEAST_STACK && RAM.size.is_multiple_of(64)) };
     // SAFETY: it is in the RAM; the caller guarantees that nothing uses it.
-    unsafe { clear(LAYOUT.ram.base, LAYOUT.ram.end() - LEAST_STACK) };
+    unsafe { clear(RAM.base, RAM.end() - LEAST_STACK) };
 }
 
 /// Clears memory, 64 bytes at a time, without a stack: Reset calls it, too.

@@ -14,7 +14,7 @@ use coflash_core::device::{legacy, Session};
 use coflash_core::file::board::NamedError;
 use coflash_core::file::convert::ConvertError;
 use coflash_core::file::sealed::Refusal;
-use coflash_core::file::{judge, Cause, FileError};
+use coflash_core::file::{judge, ram_image, Cause, FileError};
 use coflash_core::machine;
 use coflash_core::update::{refusal_number, ContentFault, DeviceAfterUpdate, DeviceAnswer};
 use coflash_core::Error;
@@ -493,7 +493,9 @@ impl Failure {
     /// A file that is nothing for a device.
     pub(super) fn content(path: &Path, fault: ContentFault) -> Self {
         match fault {
-            ContentFault::Bootloader(fault) => Self::file(path, format_args!("it {fault}")),
+            ContentFault::Bootloader(fault) => {
+                Self::file(path, format_args!("it {fault}")).advised(ram_image::Fault::ADVICE)
+            }
             ContentFault::Sealed(refusal) => Self::sealed(path, &refusal),
             ContentFault::NoProgram { board, program, programs } => {
                 Self::no_such_program(board, program, programs)

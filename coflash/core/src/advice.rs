@@ -437,8 +437,8 @@ advice! {
     /// For a file with programs for several boards.
     OneBoard => "[give|choose] the HEX file of your board alone",
     /// For a file with a program and other data.
-    ProgramAlone => "[give|choose] the file of the program alone[, or leave out the rest: --start-address with the \
-        begin of the program, and --end-address|]; other data are written in production, with a debug probe",
+    ProgramAlone => "[give|choose] the file of the program alone[, or leave out the rest: --start-address (in place \
+        of --board) with the first address of the program, and --end-address|]; a debug probe writes the other data",
     /// For a program that covers staging.
     EndBeforeStaging => "for a renewal later, let the program end before that, with what the tool chain adds at \
         its end: a checksum, a trailer, fill bytes",

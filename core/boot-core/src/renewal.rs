@@ -122,7 +122,7 @@ pub fn check_contents<F: Flash>(
     layout: &Layout,
     host: Host,
 ) -> Result<(), Damage> {
-    header.check(place.size - Header::SIZE, layout.ram, host)?;
+    header.check(place.size - Header::SIZE, layout.bootloader_ram(), host)?;
     let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
     if header.crc != 0 && flash.crc32(0, covered) != header.crc {
         return Err(Damage::Crc);

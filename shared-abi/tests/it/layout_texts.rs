@@ -56,6 +56,8 @@ fn the_linker_script_of_a_program() {
         "__label_end = 0x08020200;",
         "__callgate_table = 0x08000040;",
         "__callgate_table_size = 0x00000010;",
+        "__kept = 0x2001fbc0;",
+        "__kept_end = 0x2001ffc0;",
         "__handoff = 0x2001ffc0;",
         "__warm_start = 0x2001fff0;",
         "__sram_end = 0x20020000;",
@@ -63,7 +65,12 @@ fn the_linker_script_of_a_program() {
     ] {
         assert!(text.lines().any(|of| of == line), "{line}\n{text}");
     }
+    // A KiB less, with the symbols of panic-persist 0.3.
+    let keeping = LAYOUT.linker_script(Image::Program(1)).keeping_ram().to_string();
+    assert!(keeping.contains("RAM   : ORIGIN = 0x20000000, LENGTH = 0x1fbc0\n"), "{keeping}");
+    assert!(keeping.contains("_panic_dump_start = __kept;\n_panic_dump_end = __kept_end;\n"), "{keeping}");
     let bootloader = LAYOUT.linker_script(Image::Bootloader).to_string();
+    assert!(bootloader.contains("RAM   : ORIGIN = 0x20000000, LENGTH = 0x1fbc0\n"), "{bootloader}");
     assert!(bootloader.contains("FLASH : ORIGIN = 0x08000000, LENGTH = 0x3f00\n"), "{bootloader}");
     assert!(bootloader.contains("HOME  : ORIGIN = 0x08010000, LENGTH = 0x10000\n"), "{bootloader}");
     let compact = nucleo_f446re::LAYOUT.linker_script(Image::Bootloader).to_string();

@@ -67,7 +67,7 @@ pub const SOUND: Header = Header {
     length: Header::SIZE,
     size: 0,
     ram_base: LAYOUT.ram.base,
-    ram_end: LAYOUT.ram.base + LAYOUT.ram.size,
+    ram_end: LAYOUT.bootloader_ram().end(),
     services: SERVICES_VERSION,
     features: Abilities::RENEWAL,
     board: BOARD,

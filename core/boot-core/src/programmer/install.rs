@@ -62,7 +62,7 @@ impl Renewing {
         let header = Header::of_bytes(bytes);
         let Renewal { identity, revision, .. } = *self.policy;
         let room = self.places().staging.size.saturating_sub(Header::SIZE);
-        let checked = header.check(room, self.layout.ram, self.host);
+        let checked = header.check(room, self.layout.bootloader_ram(), self.host);
         if checked == Err(Damage::Facts) {
             *detail = Damage::Facts as u8;
         }
