@@ -1,7 +1,7 @@
 //! The board that a user names: one that is built into the tool, or a file with its memory map.
 //!
-//! `cargo xtask layout --toml` writes such a file. It must meet the same rules as the compiled
-//! layouts of this repository.
+//! `cargo xtask build` and `cargo xtask layout --toml` write such a file. It must meet the same rules as the
+//! compiled layouts of this repository.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,6 +9,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 use shared_abi::geometry::{self, Geometry, Line, SectorRun};
+use shared_abi::layout::toml::Circuit;
 use shared_abi::layout::{self, Layout, BOARDS};
 
 /// The largest size of such a file, in bytes.
@@ -61,8 +62,17 @@ pub fn in_folder(word: &str, folder: &Path) -> String {
 /// # Errors
 /// [`NamedError`]: no such board, or what is wrong with the file.
 pub fn named(word: &str) -> Result<&'static Layout, NamedError> {
+    described(word).map(|(layout, _)| layout)
+}
+
+/// The same with the circuit around the chip, which only a file has, and not each.
+///
+/// # Errors
+/// As [`named`].
+pub fn described(word: &str) -> Result<(&'static Layout, Option<Circuit>), NamedError> {
     if !is_file(word) {
-        return layout::by_name(word).ok_or_else(|| NamedError::Unknown(word.to_owned()));
+        let layout = layout::by_name(word).ok_or_else(|| NamedError::Unknown(word.to_owned()));
+        return layout.map(|layout| (layout, None));
     }
     let unreadable = |error: &dyn std::fmt::Display| NamedError::File(word.to_owned(), error.to_string());
     let mut bytes = Vec::new();
@@ -70,7 +80,7 @@ pub fn named(word: &str) -> Result<&'static Layout, NamedError> {
     File::open(Path::new(word))
         .and_then(|file| file.take(MAX as u64 + 1).read_to_end(&mut bytes))
         .map_err(|error| unreadable(&error))?;
-    parse(&String::from_utf8_lossy(&bytes)).map_err(|error| unreadable(&error))
+    parse_all(&String::from_utf8_lossy(&bytes)).map_err(|error| unreadable(&error))
 }
 
 /// An error in a memory map.
@@ -112,6 +122,35 @@ struct Map {
     handoff: Region,
     warm_start: Region,
     chip: Chip,
+    circuit: Option<Around>,
+}
+
+/// [`Circuit`] in a file.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct Around {
+    crystal: u32,
+    can: u8,
+    usart: String,
+    pulled_up: Option<String>,
+}
+
+impl Around {
+    fn checked(self) -> Result<Circuit, BoardError> {
+        let pin = |word: &str| {
+            let word = word.strip_prefix('P')?;
+            let port = word.chars().next().filter(|port| ('A'..='K').contains(port))?;
+            Some((port, word[1..].parse().ok().filter(|pin| *pin < 16)?))
+        };
+        let pulled_up = self.pulled_up.map(|word| pin(&word).ok_or(BoardError::Rule("a pin is PA0 to PK15")));
+        if !(1..=2).contains(&self.can) || !(1_000_000..=50_000_000).contains(&self.crystal) {
+            return Err(BoardError::Rule(
+                "a circuit has a crystal of 1 to 50 MHz, and CAN controller 1 or 2",
+            ));
+        }
+        let (crystal, can, usart) = (self.crystal, self.can, name(self.usart)?);
+        Ok(Circuit { crystal, can, usart, pulled_up: pulled_up.transpose()? })
+    }
 }
 
 #[derive(Deserialize)]
@@ -139,6 +178,10 @@ struct Sectors {
 /// # Errors
 /// [`BoardError`]: the line that cannot be read, or the rule that is broken.
 pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
+    parse_all(text).map(|(layout, _)| layout)
+}
+
+fn parse_all(text: &str) -> Result<(&'static Layout, Option<Circuit>), BoardError> {
     if text.len() > MAX {
         return Err(BoardError::Rule("a memory map has 64 KiB at most; this is another file"));
     }
@@ -183,7 +226,7 @@ pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
         warm_start: file.warm_start.into(),
     };
     chip.check().and_then(|()| layout.check()).map_err(BoardError::Rule)?;
-    Ok(Box::leak(Box::new(layout)))
+    Ok((Box::leak(Box::new(layout)), file.circuit.map(Around::checked).transpose()?))
 }
 
 /// Checks that a name is printable.
@@ -207,6 +250,15 @@ mod tests {
     fn every_board_comes_back_as_it_was_written() {
         for board in BOARDS {
             assert_eq!(parse(&Toml(board).to_string()), Ok(*board), "{}", board.board);
+        }
+        let circuit = Circuit { crystal: 25_000_000, can: 2, usart: "USART1", pulled_up: Some(('C', 13)) };
+        let own = |circuit: Circuit| format!("{}{circuit}", Toml(&stm32f429i_disc1::LAYOUT));
+        for circuit in [circuit, Circuit { pulled_up: None, ..circuit }] {
+            assert_eq!(parse_all(&own(circuit)), Ok((&stm32f429i_disc1::LAYOUT, Some(circuit))));
+        }
+        for (crystal, can, pin) in [(0, 1, ('A', 0)), (8_000_000, 3, ('A', 0)), (8_000_000, 1, ('A', 16))] {
+            let wrong = Circuit { crystal, can, pulled_up: Some(pin), ..circuit };
+            assert!(matches!(parse_all(&own(wrong)), Err(BoardError::Rule(_))), "{wrong:?}");
         }
     }
 

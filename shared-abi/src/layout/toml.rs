@@ -1,14 +1,36 @@
 //! A layout as text for the host tool (`coflash --board FILE.toml`), for boards that the tool was not
-//! built with.
+//! built with; and the circuit around the chip, for the emulator.
 
 use core::fmt;
 
 use super::Layout;
-use crate::geometry::Region;
+use crate::geometry::{Pin, Region};
 
 /// Prints a layout, with its chip, as TOML.
 #[derive(Clone, Copy, Debug)]
 pub struct Toml<'a>(pub &'a Layout);
+
+/// What is around the chip of a board, as an emulator must know it. Printed, it follows a layout.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Circuit {
+    /// The crystal, or the clock at OSC_IN, in Hz.
+    pub crystal: u32,
+    /// The CAN controller with the transceiver, 1 or 2.
+    pub can: u8,
+    /// The name of the USART that is led out.
+    pub usart: &'static str,
+    /// A pin that a resistor on the board pulls up.
+    pub pulled_up: Option<Pin>,
+}
+
+impl fmt::Display for Circuit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { crystal, can, usart, pulled_up } = self;
+        writeln!(f, "\n# The circuit around the chip, for the emulator. The crystal is in Hz.\n[circuit]")?;
+        writeln!(f, "crystal = {crystal}\ncan = {can}\nusart = \"{usart}\"")?;
+        pulled_up.map_or(Ok(()), |(port, pin)| writeln!(f, "pulled-up = \"P{port}{pin}\""))
+    }
+}
 
 struct Table(Region);
 

@@ -115,6 +115,17 @@ pub enum Entry {
 /// An address at which no chip of this emulator has anything: external memory (PM0214 section 2.2).
 const NOWHERE: u32 = 0x6000_0000;
 
+/// The state of the CPU at a load of FLASH_SR.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Poll {
+    /// [`Slice::entries`](crate::slice::Slice::entries).
+    entry: u64,
+    cycles: u64,
+    /// LR, SP, PC and xPSR.
+    core: [u32; 4],
+    general: [u32; 13],
+}
+
 /// The data that the hooks leave for the caller.
 #[derive(Default)]
 struct Notes {
@@ -129,6 +140,8 @@ struct Notes {
     fpu_instruction: Option<u32>,
     /// Only one instruction is to run, and breakpoints do not stop it.
     single: bool,
+    /// The last load of FLASH_SR, if no other register of a peripheral was accessed since.
+    poll: Option<Poll>,
     /// Blocks looked at.
     blocks: Blocks,
     /// What the flash has at hand, where code costs what the manuals say.

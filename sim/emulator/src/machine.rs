@@ -107,7 +107,7 @@ impl Machine {
     /// Stores an ELF file in flash as a debug probe does: bytes outside the image stay unchanged.
     ///
     /// # Errors
-    /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
+    /// [`Error::Image`] or [`Error::Flash`]; the flash is as before then.
     pub fn load(&mut self, image: &[u8]) -> Result<LoadedImage, Error> {
         let (segments, entry) = image::parse_elf(image)?;
         Ok(LoadedImage { segments: self.load_segments(&segments)?, entry: Some(entry) })
@@ -116,7 +116,7 @@ impl Machine {
     /// Stores an Intel HEX file in flash as a debug probe does.
     ///
     /// # Errors
-    /// [`Error::Image`] or [`Error::Address`]; the flash is as before then.
+    /// [`Error::Image`] or [`Error::Flash`]; the flash is as before then.
     pub fn load_hex(&mut self, text: &str) -> Result<LoadedImage, Error> {
         let segments = image::parse_hex(text)?;
         Ok(LoadedImage { segments: self.load_segments(&segments)?, entry: None })
@@ -136,7 +136,7 @@ impl Machine {
     /// Stores bytes in flash, or in the one-time programmable (OTP) bytes, as a debug probe does.
     ///
     /// # Errors
-    /// [`Error::Address`] where they are not all in flash or in open blocks of the OTP bytes.
+    /// [`Error::Flash`] or [`Error::Address`] where they are not all in flash or in open blocks of the OTP bytes.
     pub fn load_bin(&mut self, address: u32, bytes: &[u8]) -> Result<(), Error> {
         if is_otp(address, bytes.len()) {
             let is_open = self.cpu.chip_mut().program_otp(address, bytes);
@@ -168,10 +168,10 @@ impl Machine {
     }
 
     fn check_flash(&self, address: u32, len: usize) -> Result<u32, Error> {
-        let flash = self.cpu.chip().geometry.flash;
+        let chip = self.cpu.chip().geometry;
         match u32::try_from(len) {
-            Ok(bytes) if flash.contains(address, bytes) => Ok(address - flash.base),
-            _ => Err(Error::Address { address, len, wanted: "flash" }),
+            Ok(bytes) if chip.flash.contains(address, bytes) => Ok(address - chip.flash.base),
+            _ => Err(Error::Flash { address, len, chip }),
         }
     }
 

@@ -7,7 +7,7 @@ use unicorn_engine::{RegisterARM, UcHookId, Unicorn};
 
 use super::blocks::count_instructions;
 use super::instruction::{self, Instruction};
-use super::{failed, masks, read, Cpu, Fault, Notes, State, NOWHERE, XPSR_IT};
+use super::{failed, masks, read, Cpu, Fault, Notes, Poll, State, NOWHERE, XPSR_IT};
 use crate::chip::memory_map::{
     counts_cycles, HIDDEN, OPTION_PAGE, OTP, PATCHED, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
     PRIVATE, SRAM_ALIAS, SYSTEM,
@@ -20,6 +20,9 @@ use crate::error::Error;
 use crate::memory::{HostMemory, PAGE};
 use crate::report::Access;
 use crate::time::Time;
+
+/// The register whose bit BSY programs wait for.
+const FLASH_SR: u32 = 0x4002_3C0C;
 
 impl Cpu {
     pub(super) fn map_memories(&mut self) -> Result<(), Error> {
@@ -57,12 +60,18 @@ impl Cpu {
                     let address = base + offset as u32;
                     note_moment(uc, Access::Read, address);
                     let value = uc.get_data_mut().chip.load(address, size as u8);
+                    if address == FLASH_SR {
+                        skip_rounds(uc);
+                    } else {
+                        uc.get_data_mut().notes.poll = None;
+                    }
                     locate_reports(uc);
                     u64::from(value)
                 }),
                 Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
                     let address = base + offset as u32;
                     note_moment(uc, Access::Write, address);
+                    uc.get_data_mut().notes.poll = None;
                     uc.get_data_mut().chip.store(address, size as u8, value as u32);
                     settle_bus_error(uc);
                     locate_reports(uc);
@@ -254,6 +263,27 @@ fn note_moment(uc: &mut Unicorn<'_, State>, access: Access, address: u32) {
     notes.located = located;
     notes.blocks.moments.insert(key, (located, ahead));
     chip.slice.ahead = ahead;
+}
+
+/// A load of FLASH_SR. A program that asks again with all registers as they were, and with no event, no exception and no
+/// other register of a peripheral in between, waits for BSY in a loop. The rounds up to the next event pass in one
+/// piece, each with its cycles: the loop is where it would be. The host needs more time for them than the chip, and its
+/// clients would wait.
+fn skip_rounds(uc: &mut Unicorn<'_, State>) {
+    let core = [RegisterARM::LR, RegisterARM::SP, RegisterARM::PC, RegisterARM::XPSR].map(|it| read(uc, it));
+    let general = std::array::from_fn(|n| uc.reg_read(RegisterARM::R0 as i32 + n as i32).unwrap_or(0) as u32);
+    let State { chip, notes } = uc.get_data_mut();
+    if chip.flash.busy_until().is_none() || notes.single {
+        notes.poll = None;
+        return;
+    }
+    let mut poll = Poll { entry: chip.slice.entries, cycles: chip.clock.cycles, core, general };
+    if let Some(before) = notes.poll.filter(|before| Poll { cycles: poll.cycles, ..*before } == poll) {
+        let round = (poll.cycles - before.cycles).max(1);
+        poll.cycles += chip.slice.end.saturating_sub(poll.cycles) / round * round;
+        chip.clock.cycles = poll.cycles;
+    }
+    notes.poll = Some(poll);
 }
 
 fn stop(uc: &mut Unicorn<'_, State>) {

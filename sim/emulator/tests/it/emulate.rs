@@ -156,7 +156,10 @@ fn refuses_with_a_reason() {
         (&[&elf], "broken.elf"),
         (&[&hex], "line 2"),
         (&[&outside], "20000000h"),
-        (&[&at_the_end], "080FFFF8h"),
+        (
+            &[&at_the_end],
+            "16 bytes at 080FFFF8h are not all in the flash of the STM32F407VG, which has 1024 KiB",
+        ),
         (&[&no_address], "`flash` is not a hexadecimal address"),
         (&[&image, "--board", "nucleo"], "stm32f407g-disc1"),
         (&[&image, "--speed", "0"], "neither `max` nor a number"),
@@ -198,6 +201,22 @@ fn serves_clients_until_ctrl_c() {
     // The program does not use its CAN controller, so no node acknowledges.
     let sent = board.line_with("123#AB");
     assert!(sent.contains("no acknowledge"), "{sent}");
+    let last = board.interrupt();
+    assert!(last.contains("end: 0 frames"), "{last}");
+}
+
+/// All bytes are the client's, and none is shown as text.
+#[test]
+#[cfg(unix)]
+fn a_client_at_the_uart_gets_what_the_board_says() {
+    let image = program(&folder("serial"), "says_u");
+    let mut board = Running::start(&[&image, "--serial", "127.0.0.1:0"]);
+    let mut client = TcpStream::connect(board.after("USART2 is at tcp://")).unwrap();
+    client.set_read_timeout(Some(std::time::Duration::from_secs(20))).unwrap();
+    let mut heard = [0; 1000];
+    client.read_exact(&mut heard).unwrap();
+    assert_eq!(heard, [b'U'; 1000]);
+    drop(client);
     let last = board.interrupt();
     assert!(last.contains("end: 0 frames"), "{last}");
 }

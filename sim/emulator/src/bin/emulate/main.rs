@@ -32,6 +32,8 @@ use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
 use flash_file::FlashFile;
 use shared_abi::geometry::{self, Geometry, Region};
+use shared_abi::layout::toml::Circuit;
+use shared_abi::layout::Layout;
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
@@ -41,13 +43,14 @@ use shared_abi::geometry::{self, Geometry, Region};
 #[derive(Debug, Parser)]
 #[command(name = "emulate", version)]
 struct Args {
-    /// The board: its name, or the file with its memory map, as `cargo xtask layout --toml` writes it
+    /// The board: its name, or its file, as `cargo xtask build` writes it beside the images. The file has the
+    /// crystal, the CAN controller and the UART, too; for a name it is looked for beside the bootloader
     #[arg(long, value_name = "BOARD|FILE", default_value = "stm32f407g-disc1", value_parser = board)]
     board: Board,
 
-    /// The board's crystal or clock, in Hz
-    #[arg(long, value_name = "HZ", default_value_t = 8_000_000)]
-    hse: u32,
+    /// The crystal or clock in Hz, where it is not the one of the board
+    #[arg(long, value_name = "HZ")]
+    hse: Option<u32>,
 
     /// The CAN controller that the transceiver is at, 1 or 2, where it is not the one of the board
     #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(1..=2))]
@@ -145,21 +148,15 @@ struct Args {
     run_for: Option<Time>,
 }
 
-/// The properties of a board: its chip, pins that a resistor pulls up, its serial port.
+/// A board, and the circuit around its chip, if its file has it.
 #[derive(Clone, Copy, Debug)]
 struct Board {
-    chip: &'static Geometry,
-    pulled_up: &'static [(char, u8)],
-    /// The USART that is led out.
-    usart: &'static str,
-    /// The CAN controller that the transceiver is at, as in `Options`.
-    transceiver: usize,
+    layout: &'static Layout,
+    circuit: Option<Circuit>,
 }
 
-/// A board has its serial port at USART2, its transceiver at CAN1 and no resistors at its pins,
-/// unless it is listed here.
 fn board(name: &str) -> Result<Board, String> {
-    let layout = coboot_linker::board::named(name).map_err(|error| error.to_string())?;
+    let (layout, circuit) = coboot_linker::board::described(name).map_err(|error| error.to_string())?;
     let chip = layout.chip;
     // A file may contain a chip that nobody makes.
     let memories = |chip: &Geometry| (chip.flash, chip.sram, chip.ccm);
@@ -169,14 +166,29 @@ fn board(name: &str) -> Result<Board, String> {
             chip.chip
         ));
     }
-    let plain = Board { chip: layout.chip, pulled_up: &[], usart: "USART2", transceiver: 0 };
-    Ok(match layout.board {
-        "stm32f407g-disc1-can2" => Board { transceiver: 1, ..plain },
-        // B1 (UM1724).
-        "nucleo-f446re" => Board { pulled_up: &[('C', 13)], ..plain },
-        "stm32f429i-disc1" => Board { usart: "USART1", ..plain },
-        _ => plain,
-    })
+    Ok(Board { layout, circuit })
+}
+
+impl Board {
+    /// The circuit around the chip: of the board's file, or of the one that a build has put beside this bootloader. A
+    /// board without either has 8 MHz, its transceiver at CAN1, its serial port at USART2 and no resistors at its pins,
+    /// unless it is listed here.
+    fn circuit(&self, bootloader: Option<&Path>) -> Circuit {
+        let name = self.layout.board;
+        let beside = || {
+            let file = bootloader?.parent()?.join(name).with_extension("toml");
+            let (layout, circuit) = coboot_linker::board::described(file.to_str()?).ok()?;
+            circuit.filter(|_| layout.board == name)
+        };
+        let plain = Circuit { crystal: 8_000_000, can: 1, usart: "USART2", pulled_up: None };
+        self.circuit.or_else(beside).unwrap_or(match name {
+            "stm32f407g-disc1-can2" => Circuit { can: 2, ..plain },
+            // B1 (UM1724).
+            "nucleo-f446re" => Circuit { pulled_up: Some(('C', 13)), ..plain },
+            "stm32f429i-disc1" => Circuit { usart: "USART1", ..plain },
+            _ => plain,
+        })
+    }
 }
 
 /// The longest `--for`: 200 days.
@@ -341,10 +353,12 @@ struct Watched {
 const LONGEST_LINE: usize = 256;
 
 impl Watched {
-    /// The text that its USARTs have sent since the last call, with the time of its end.
-    fn serial(&mut self, machine: &mut Machine) -> Vec<(Time, String)> {
+    /// The text that its USARTs have sent since the last call, with the time of its end: of all but the one
+    /// that a client has, whose bytes are the client's.
+    fn serial(&mut self, machine: &mut Machine, of_client: Option<&str>) -> Vec<(Time, String)> {
         let mut lines = Vec::new();
-        for usart in machine.usarts_mut() {
+        let usarts = machine.usarts_mut().iter_mut();
+        for usart in usarts.filter(|usart| Some(usart.instance().name) != of_client) {
             let name = usart.instance().name;
             for Character { end, byte, bit_rate } in usart.take_sent() {
                 let line = self.serial.entry((name, bit_rate)).or_default();
@@ -366,11 +380,15 @@ const STEPS: usize = 100;
 /// How long a step may take before it waits for the wall clock as everything does.
 const STEP: Span = Span::from_micros(10);
 
+/// How much virtual time passes at most before the clients are looked after. A frame with data takes longer.
+const SLICE: Span = Span::from_micros(100);
+
 /// How often a board's RAM is looked at for what it reports to a debug probe.
 const POLL: Span = Span::from_millis(5);
 
 impl Bench {
     fn new(args: &Args) -> Result<Self> {
+        let (chip, circuit) = (args.board.layout.chip, args.board.circuit(args.bootloader.as_deref()));
         let mut flash = None;
         let mut world = World::new();
         let mut boards = Vec::new();
@@ -378,24 +396,24 @@ impl Bench {
             let mut unique_id = Options::default().unique_id;
             unique_id[0] += u32::from(n);
             let machine = Machine::new(
-                args.board.chip,
+                chip,
                 Options {
                     seed: args.seed.wrapping_add(u64::from(n)),
-                    hse_hz: args.hse,
+                    hse_hz: args.hse.unwrap_or(circuit.crystal),
                     flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
                     unique_id,
                     costs: args.costs,
-                    transceiver: args.can.map_or(args.board.transceiver, |can| usize::from(can) - 1),
+                    transceiver: usize::from(args.can.unwrap_or(circuit.can)) - 1,
                     silicon: args.silicon.unwrap_or(Choice::Typical).of_board(n.into()),
                     vdd_mv: args.vdd,
                 },
             );
             let mut machine = machine.context("setting up the board")?;
-            for &(port, pin) in args.board.pulled_up {
+            if let Some((port, pin)) = circuit.pulled_up {
                 machine.set_pin(port, pin, Some(true));
             }
             if let Some(path) = &args.flash {
-                flash = Some(FlashFile::open(path, args.board.chip, &mut machine)?);
+                flash = Some(FlashFile::open(path, chip, &mut machine)?);
             }
             if images(args).next().is_none() && !flash.as_ref().is_some_and(FlashFile::is_filled) {
                 bail!("the flash would be empty: name at least one image, for example --bootloader FILE");
@@ -406,7 +424,7 @@ impl Bench {
             boards.push(Watched {
                 id: world.add_machine(machine),
                 shown: 0,
-                sram: args.board.chip.sram,
+                sram: chip.sram,
                 log: rtt::Reader::with(decoder(args)?),
                 poll: Time(0),
                 serial: BTreeMap::new(),
@@ -457,7 +475,13 @@ impl Bench {
             self.server = Some(server);
         }
         if let Some(place) = &args.serial {
-            let usart = args.board.usart;
+            let usart = args.board.circuit(args.bootloader.as_deref()).usart;
+            if self.world.machine_mut(self.boards[0].id).usart_mut(usart).is_none() {
+                bail!(
+                    "the {} has no {usart}: correct `usart` in the board's file",
+                    args.board.layout.chip.chip
+                );
+            }
             let serial = match place.as_str() {
                 #[cfg(unix)]
                 "pty" => Serial::terminal(usart).context("a pseudo-terminal")?,
@@ -534,7 +558,8 @@ impl Bench {
             let target = pacer.target(wall, now).min(last);
             let awake = wall < awake_until || target == last || pacer.is_worth_it(now, target);
             if target > now && awake && !halted {
-                self.world.run_until(target);
+                let slice = if wall < awake_until { SLICE } else { target - now };
+                self.run_in_slices(target, slice, &mut pacer);
             } else {
                 // The threads of the clients unpark this one.
                 let nap = if self.serial.is_some() || wall < awake_until { SHORT_NAP } else { NAP };
@@ -554,6 +579,18 @@ impl Bench {
             }
         }
         Ok(())
+    }
+
+    /// Runs the world to `target`, or until a client has got something. While the device works more than the host keeps
+    /// up with, as when it programs what came in during an erase, a step takes many milliseconds of the wall clock: a
+    /// request does not wait for its end, and neither does an answer.
+    fn run_in_slices(&mut self, target: Time, slice: Span, pacer: &mut Pacer) {
+        while self.world.now() < target && !self.world.is_halted() {
+            self.world.run_until(target.min(self.world.now() + slice));
+            if self.world.now() < target && self.exchange(pacer) {
+                break;
+            }
+        }
     }
 
     /// Lets the clients take part; whether one has got something.
@@ -675,6 +712,7 @@ impl Bench {
 
     /// Prints the events since the last call, in their order in time.
     fn print_report(&mut self) -> Result<()> {
+        let of_client = self.serial.as_ref().map(Serial::usart);
         let mut lines = std::mem::take(&mut *self.unprinted.borrow_mut());
         while let Some(news) = self.world.news() {
             let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
@@ -691,7 +729,7 @@ impl Bench {
             let now = self.world.now();
             lines.extend(
                 board
-                    .serial(self.world.machine_mut(board.id))
+                    .serial(self.world.machine_mut(board.id), of_client)
                     .into_iter()
                     .map(|(at, line)| (at, format!("{name}: {line}"))),
             );
@@ -747,4 +785,31 @@ fn happened(stop: Stop, cause: impl Fn() -> String) -> Option<String> {
             format!("the CPU has locked up by {}: only a reset helps it", cause())
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The circuit comes from the board's file, and for a board's name from the file beside the bootloader.
+    #[test]
+    fn a_board_has_the_circuit_of_its_file() {
+        let folder = std::env::temp_dir().join(format!("coboot-emulate-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let own = Circuit { crystal: 25_000_000, can: 2, usart: "USART1", pulled_up: Some(('A', 0)) };
+        let file = folder.join("nucleo-f446re.toml");
+        let map = include_str!("../../../tests/it/my-board.toml");
+        let named = map.replace("my-board", "nucleo-f446re");
+        std::fs::write(&file, format!("{named}{own}")).unwrap();
+        let bootloader = folder.join("bootloader.elf");
+        let circuit = |word: &str, beside| board(word).unwrap().circuit(beside);
+        assert_eq!(circuit(file.to_str().unwrap(), None), own);
+        assert_eq!(circuit("nucleo-f446re", Some(&bootloader)), own);
+        let known = Circuit { crystal: 8_000_000, can: 1, usart: "USART2", pulled_up: Some(('C', 13)) };
+        assert_eq!(circuit("nucleo-f446re", None), known);
+        // The file is that of another board.
+        std::fs::write(&file, format!("{map}{own}")).unwrap();
+        assert_eq!(circuit("nucleo-f446re", Some(&bootloader)), known);
+        std::fs::remove_dir_all(folder).unwrap();
+    }
 }

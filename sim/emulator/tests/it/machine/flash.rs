@@ -45,6 +45,20 @@ fn code_in_ram_goes_on_and_new_code_in_flash_is_seen() {
     assert_eq!(machine.counters().flash_stalls, 0);
 }
 
+/// A round takes four cycles: the loop would execute three million instructions. It ends when the erase does, after
+/// some 20 instructions and 250 ms.
+#[test]
+fn a_loop_that_only_waits_for_the_flash_costs_the_host_nothing() {
+    let mut machine = machine_in_ram(&programs::POLLS_THE_FLASH, 0, Options::default());
+    machine.write_ram(OUT, &[0; 4]).unwrap();
+    machine.run_until(ms(250));
+    assert_eq!((word(&machine, OUT), machine.counters().sectors_erased), (0, 0));
+    machine.run_until(Time(250 * MS + MS / 200));
+    assert_eq!((word(&machine, OUT), machine.counters().sectors_erased), (1, 1));
+    let instructions = machine.counters().instructions;
+    assert!(instructions < 10_000, "{instructions}");
+}
+
 #[test]
 fn a_load_from_busy_flash_stalls_code_in_ram() {
     let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 1, Options::default());

@@ -36,6 +36,7 @@ macro_rules! programs {
 
 programs! {
     STORES_AND_SLEEPS,
+    POLLS_THE_FLASH,
     SYSTICK,
     NESTING,
     MASKS,
