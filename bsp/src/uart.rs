@@ -20,6 +20,9 @@ pub const fn divider(clock: u32, bit_rate: u32) -> Option<u16> {
 /// Selects the board's USART; its interrupt has the same name.
 macro_rules! uart {
     ($usart:ident) => {
+        /// The name of the UART.
+        pub const UART: &str = stringify!($usart);
+
         /// The UART. It is set up with the feature `uart` alone.
         #[cfg(target_arch = "arm")]
         pub type UartController = stm32f4xx_hal::pac::$usart;

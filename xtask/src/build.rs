@@ -17,8 +17,9 @@ use crate::{elf, files, outcome::Outcome, process, ram_image, workspace};
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]
 
-Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
-bootloader, app-v1 and app-v2; a wrong NAME lists the others.
+Builds images of a board and puts them into target/firmware/BOARD/NAME.elf, and beside them the board's file,
+BOARD.toml, for `emulate --board` and `coflash --board`. Without a NAME it builds bootloader, app-v1 and app-v2; a
+wrong NAME lists the others. Cargo decides each time what has changed.
 app-c is the application in C, for each program of the board, and with the tests' objects (app-c-probe).
 
   --all           every image of the board and the applications in C: what the tests need
@@ -200,22 +201,22 @@ fn all(board: &Layout) -> Vec<&'static str> {
     Variant::of(board).map(|of| of.name).chain([C_APPLICATION]).collect()
 }
 
-/// Builds images of a board by their names, and prints their sizes; a bootloader as one of this product, if there is one.
+/// Builds images of a board by their names, and prints their sizes; a bootloader as one of this product, if there is
+/// one. Cargo says what has changed: it alone knows of crates outside of the repository and of variables.
 fn build(board: &Layout, names: &[&str], product: Option<&Product>) -> Outcome {
-    for name in names {
-        if *name == C_APPLICATION {
-            c_applications(board)?;
-            continue;
-        }
-        let variant = Variant::by_name(board, name)?;
-        match product {
-            Some(product) if variant.is_bootloader() => {
-                image(board, variant, &variant.name_of(product)?, product)?;
-            }
-            _ => renewed(board, variant)?,
-        }
-    }
-    Ok(())
+    board_file(board)?;
+    each(board, names, |variant| match product.filter(|_| variant.is_bootloader()) {
+        Some(product) => image(board, variant, &variant.name_of(product)?, product),
+        None => image(board, variant, variant.name, &variant.product()?),
+    })
+}
+
+/// Builds images of a board by their names: each by this function, or the applications in C.
+fn each(board: &Layout, names: &[&str], of_one: impl Fn(&Variant) -> Outcome) -> Outcome {
+    names.iter().try_for_each(|name| match *name {
+        C_APPLICATION => c_applications(board),
+        name => of_one(Variant::by_name(board, name)?),
+    })
 }
 
 /// The same without another product; returns the folder of the images.
@@ -224,12 +225,24 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     Ok(workspace::firmware_dir(board))
 }
 
+/// The file of a board, for programs that were not built with it.
+pub fn file_of(board: &Layout) -> PathBuf {
+    workspace::firmware_dir(board).join(format!("{}.toml", board.board))
+}
+
+/// Writes it. The board's own crate knows what is around the chip.
+fn board_file(board: &Layout) -> Outcome {
+    let mut cargo = process::cargo("run --quiet --package bsp --example board");
+    cargo.env("COBOOT_BOARD", board.board).arg("--target-dir").arg(target_dir(board));
+    files::write(&file_of(board), process::output(&mut cargo)?)
+}
+
 /// What the images are made of. The crates of others are in Cargo.lock.
 const SOURCES: &str = ".cargo Cargo.lock Cargo.toml app-template bootloader bsp coboot-app core linker \
                        rust-toolchain.toml shared-abi tests/apps";
 
-/// Builds an image of its own product, unless it was built after the last change of its sources and of this program:
-/// cargo keeps only the last product of a program, and would link all others once more.
+/// Builds an image for a run of tests, unless such a run has built it after the last change of its sources and of this
+/// program: cargo keeps only the last product of a program, and would link all others once more.
 fn renewed(board: &Layout, variant: &Variant) -> Outcome {
     let (elf, stamp) = (elf_of(board, variant.name), elf_of(board, variant.name).with_extension("built"));
     let program = std::env::current_exe().map_err(|error| format!("this program has no path: {error}"))?;
@@ -256,12 +269,12 @@ fn elf_of(board: &Layout, name: &str) -> PathBuf {
     workspace::firmware_dir(board).join(format!("{name}.elf"))
 }
 
-/// Builds the images with these names for several boards, or everything where there are no names; several chips at
-/// once, since the last step of each image uses only one core.
+/// Builds the images that tests need, with these names for several boards, or everything where there are no names;
+/// several chips at once, since the last step of each image uses only one core.
 pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
     let of_board = |(board, names): (&Layout, &str)| {
         let names = if names.is_empty() { all(board) } else { names.split_whitespace().collect() };
-        build(board, &names, None)
+        each(board, &names, |variant| renewed(board, variant))
     };
     let chips: BTreeSet<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     std::thread::scope(|scope| {
@@ -411,6 +424,8 @@ fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Ou
         file = ram_image::seal(file).map_err(|problem| format!("{name} gets no CRC: {problem}"))?;
     }
     let to = elf_of(board, name);
+    // What the caller's variables made of it is nothing for a run of tests.
+    let _ = fs::remove_file(to.with_extension("built"));
     // An unchanged file is not written, so that its time does not change.
     if fs::read(&to).ok().as_ref() != Some(&file) {
         files::write(&to, file)?;
@@ -418,16 +433,26 @@ fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Ou
     report(&to, &variant.regions(board))
 }
 
-/// Prints the size of an image.
+/// Prints the size of an image, and a warning if it is a program for any product.
 pub fn report(image: &Path, regions: &[Region]) -> Outcome {
     let file = files::bytes(image)?;
-    let used = elf::segments(&file).and_then(|segments| elf::used(&segments, regions));
+    let segments = elf::segments(&file)?;
+    let used = elf::used(&segments, regions);
     let used = used.map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.
     let used: Vec<_> =
         used.iter().zip(regions).map(|(bytes, region)| format!("{bytes} of {}", region.size)).collect();
     eprintln!("  {:<52} {} bytes", workspace::shown(image), used.join(" + "));
+    if regions
+        .iter()
+        .any(|region| elf::label(&segments, *region).is_some_and(|label| label.product_code == 0))
+    {
+        eprintln!(
+            "  warning: its label has product code 0, which is any: a device of another product takes it. Set the \
+             product code (docs/porting.md, step 5)."
+        );
+    }
     Ok(())
 }
 

@@ -6,6 +6,7 @@ use object::elf::PT_LOAD;
 use object::read::elf::{ElfFile32, ProgramHeader};
 use object::LittleEndian;
 use shared_abi::geometry::Region;
+use shared_abi::label::{self, Label};
 
 use crate::outcome::Outcome;
 
@@ -78,6 +79,15 @@ pub fn used(segments: &[Segment], regions: &[Region]) -> Outcome<Vec<u32>> {
         [] => Err("the image loads nothing into flash.".into()),
         _ => Ok(used),
     }
+}
+
+/// The label of the program in a region, if it has one.
+pub fn label(segments: &[Segment], region: Region) -> Option<Label> {
+    let at = region.base + label::OFFSET;
+    segments.iter().find_map(|Segment { address, bytes, .. }| {
+        let from = at.checked_sub(*address)? as usize;
+        Label::parse(bytes.get(from..from + label::SIZE)?.try_into().ok()?)
+    })
 }
 
 /// A number of bytes, in KiB if it is a whole number of them.

@@ -11,8 +11,8 @@ usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [OPTION
 
 Sets the machine up, builds a bootloader and runs the emulated board with it in its flash.
 
-  --board BOARD   the board (default: stm32f407g-disc1), or with --bootloader the file with its memory map,
-                  NAME.toml
+  --board BOARD   the board (default: stm32f407g-disc1), or with --bootloader its file, which `cargo xtask build`
+                  writes beside the images: BOARD.toml
   --log[=WAY]     the bootloader that logs what it does, and its log. WAY: rtt (text for a debug
                   probe; the default), defmt (the same by defmt), uart (text out of the board's UART)
   --virtual-can   the bootloader that speaks CAN over the board's UART, which a pseudo-terminal leads to
@@ -21,9 +21,9 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
                   --app FILE                      an application in flash, as a debug probe puts it there
                   --serial pty                    where other programs reach the board's UART
                   --trace FILE                    the bus as a candump log
-                  --hse HZ                        the crystal, if it has not 8 MHz
+                  --hse HZ                        another crystal than the board's
                   --silicon SEED                  a chip that the seed draws, within what the manuals leave open
-                  --can NUMBER                    the CAN controller that the transceiver is at
+                  --can NUMBER                    another CAN controller for the transceiver
                   --flash FILE                    keeps the flash from one run to the next
                   --control 127.0.0.1:29600       where commands for power, reset and pins are taken
                   --gdb 127.0.0.1:3333            where gdb is let in
@@ -54,7 +54,7 @@ pub fn run(mut args: Args) -> Outcome {
         build::Variant::by_name(board, &bootloader)?;
         setup::prepare(&[Part::Firmware, Part::Emulator])?;
         let dir = build::images(board, &[&bootloader])?;
-        emulator.args([board.board, "--bootloader"]).arg(dir.join(format!("{bootloader}.elf")));
+        emulator.arg(build::file_of(board)).arg("--bootloader").arg(dir.join(format!("{bootloader}.elf")));
     }
     if virtual_can && !has("--serial") {
         emulator.args(["--serial", "pty"]);

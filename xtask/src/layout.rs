@@ -15,7 +15,7 @@ Prints the memory map of a board from the one source of truth, shared-abi/src/la
   --ld IMAGE      prints the linker's MEMORY and border symbols instead, for an IMAGE of
                   `bootloader` or `program-N` (N from 1); a C application includes it too
   --toml          prints the map for `coflash --board FILE.toml` instead: for a coflash that was built
-                  without the board
+                  without the board. `cargo xtask build` writes it with the circuit around the chip
 ";
 
 pub fn run(mut args: Args) -> Outcome {

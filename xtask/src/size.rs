@@ -42,7 +42,9 @@ pub fn run(mut args: Args) -> Outcome {
 
     let names = |board: &Layout| if board.home.is_some() { SPLIT_MAP } else { COMPACT_MAP };
     let gated: Vec<_> = BOARDS.iter().map(|board| (*board, names(board))).collect();
-    build::boards(&gated)?;
+    for (board, names) in &gated {
+        build::images(board, &names.split(' ').collect::<Vec<_>>())?;
+    }
     println!("board                    image                      at         bytes     of");
     let mut problems = Vec::new();
     let (mut images, mut count) = (Vec::new(), 0);
