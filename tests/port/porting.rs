@@ -4,8 +4,11 @@
 //! The tests work on a copy of the repository, one after the other.
 
 use std::fs;
+use std::net::{TcpListener, TcpStream};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::time::Duration;
 
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
@@ -146,14 +149,7 @@ fn a_board_is_made_as_the_guide_says() {
     {
         assert!(text.contains(line), "{line}:\n{text}");
     }
-    for (step, old, new) in [
-        (5, "product_code: 0,", "product_code: 0x1234_5678,"),
-        (5, "device_name: \"my-board\"", "device_name: \"a node of my own\""),
-    ] {
-        println!("step {step}: {new}");
-        copy.edit(board, old, new);
-    }
-    copy.edit(new[0], "PRODUCT_CODE UINT32_C(0)", "PRODUCT_CODE UINT32_C(0x12345678)");
+    copy.edit(board, "device_name: \"my-board\"", "device_name: \"a node of my own\"");
 
     let app_c = copy.target.join("firmware/my-board/app-c.elf");
     // The result of an earlier run.
@@ -164,6 +160,73 @@ fn a_board_is_made_as_the_guide_says() {
     let output = copy.xtask(&["demo", "--board", "my-board"]);
     assert!(output.contains("An emulated my-board"), "{output}");
     assert!(output.contains("a node of my own"), "the device does not say its name:\n{output}");
+}
+
+/// Three boards with other crystals and CAN controllers than the first: each is built, offered by the emulator to other
+/// programs and updated, without an option for what `new-board` was told.
+#[test]
+fn boards_with_other_crystals_are_emulated_by_their_names() {
+    let copy = Copy::new();
+    let boards =
+        ["a-12 STM32F405RGT6 12000000 1", "b-16 STM32F446RET6 16000000 2", "c-25 STM32F413RHT6 25000000 1"];
+    let boards = boards.map(|words| words.split(' ').collect::<Vec<_>>());
+    for board in &boards {
+        let [name, chip, crystal, can] = board[..] else { panic!("{board:?}") };
+        copy.xtask(&["new-board", name, "--chip", chip, "--crystal", crystal, "--can", can]);
+    }
+    for name in boards.iter().map(|board| board[0]) {
+        copy.xtask(&["build", "app-v1", "--board", name]);
+        let at =
+            TcpListener::bind("127.0.0.1:0").and_then(|free| free.local_addr()).expect("a port").to_string();
+        let words = ["run", "-q", "-p", "xtask", "--", "emulate", "--board", name, "--socketcand", &at];
+        let mut emulator = Command::new(env!("CARGO"));
+        emulator.current_dir(&copy.root).args(words).env("CARGO_TARGET_DIR", &copy.target).process_group(0);
+        let mut emulator = emulator.spawn().expect("cargo can be started");
+        while TcpStream::connect(&at).is_err() {
+            assert!(emulator.try_wait().expect("its state").is_none(), "{name}: the emulator has ended");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        let images = copy.target.join("firmware").join(name);
+        let mut coflash = coboot_tests::tools::coflash();
+        coflash.args(["--bus", &format!("socketcand://{at}/can0"), "flash", "--board"]);
+        let updated =
+            coflash.arg(images.join(name).with_extension("toml")).arg(images.join("app-v1.elf")).output();
+        let ended = Command::new("kill").args(["-INT", "--", &format!("-{}", emulator.id())]).status();
+        assert!(ended.expect("kill can be started").success());
+        emulator.wait().expect("it ends");
+        println!("{name}: {}", coboot_tests::tools::succeeded(&updated.expect("coflash can be started")));
+    }
+}
+
+/// Cargo's knowledge of what an image is made of is larger than the repository: a crate beside it, and a variable.
+#[test]
+fn a_build_takes_what_has_changed_outside_of_the_repository() {
+    let copy = Copy::new();
+    let beside = kit::folder!("beside-the-copy");
+    fs::create_dir_all(beside.join("src")).expect("a folder of its own");
+    beside.write(
+        "Cargo.toml",
+        "[package]\nname = \"mine\"\nversion = \"0.1.0\"\nedition = \"2021\"\n[workspace]\n",
+    );
+    let library = |ms: u16| {
+        let text = format!("#![no_std]\n//! Mine.\n/// In ms.\npub const MS: u16 = {ms} + option_env!(\"MORE\").is_some() as u16;\n");
+        beside.write("src/lib.rs", text);
+    };
+    library(500);
+    let dependency = format!("[dependencies.mine]\npath = {:?}\n\n[build-dependencies]", &*beside);
+    copy.edit("app-template/Cargo.toml", "[build-dependencies]", &dependency);
+    copy.edit("app-template/src/objects.rs", "HEARTBEAT_MS: u16 = 500;", "HEARTBEAT_MS: u16 = mine::MS;");
+    let build = |variables: &[&str]| {
+        let words = ["run", "-q", "-p", "xtask", "--", "build", "app-v1"];
+        let built = copy.cargo(&[variables, &words].concat());
+        assert!(built.status.success(), "{}", text(&built));
+        fs::read(copy.target.join("firmware/stm32f407g-disc1/app-v1.elf")).expect("an image")
+    };
+    let first = build(&[]);
+    library(200);
+    let second = build(&[]);
+    assert!(second != first, "the crate beside the repository has changed");
+    assert!(build(&["--config", "env.MORE='1'"]) != second, "the variable has changed");
 }
 
 /// A later RAM image for devices in the field: it is built for the resident part that they have.
@@ -512,6 +575,15 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
             copy.cargo_for(board, name, &[&words[..], &features, &triple].concat())
         }
     };
+    // The page's own line, without xtask.
+    let page = fs::read_to_string(copy.root.join("docs/porting.md")).expect("the guide");
+    let line = page.lines().find(|line| line.starts_with("$ COBOOT_BOARD=nucleo-f446re ")).expect("the line");
+    let mut typed = Command::new("sh");
+    typed
+        .current_dir(&copy.root)
+        .args(["-c", &line[2..]])
+        .env("CARGO_TARGET_DIR", copy.target.join("fw/stm32f446"));
+    coboot_tests::tools::succeeded(&typed.output().expect("sh"));
     // Without a mistake the build succeeds.
     let slower = [By::BoardOf("an-f412"), By::BoardOf("an-f413")];
     let good = [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least"))];

@@ -6,7 +6,8 @@ use crate::args::Args;
 use crate::{files, outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask new-board NAME --chip CHIP [--crystal HZ] [--can N] [--pins TX,RX] [--led PIN] [--strap PIN]
+usage: cargo xtask new-board NAME --chip CHIP [--product-code CODE] [--crystal HZ] [--can N] [--pins TX,RX]
+                             [--led PIN] [--strap PIN]
 
 Creates the files of a port, with numbered steps to go through: the memory map, the board file, and the
 header with the same numbers for the application in C (for CAN1 at alternate function 9 alone). Nothing else has
@@ -15,6 +16,7 @@ docs/porting.md has the next steps.
 
   NAME            of the board, as it will be given to --board: small letters, digits and hyphens
   --chip CHIP     its chip as it is ordered, STM32F407VGT6: any STM32F4 with CAN controllers
+  --product-code CODE  of the device (1018h/2), as 1234 or 0x4D2 (default: made from the NAME)
   --crystal HZ    the crystal, 4000000 to 26000000 (default: 8000000). The clocks are made from it
   --can N         the CAN controller, 1 or 2 (default: that of --pins, or 1)
   --pins TX,RX    the pins to the transceiver: PB9,PB8 (default: such as each package has)
@@ -30,6 +32,7 @@ pub fn run(mut args: Args) -> Outcome {
         pins: args.value("--pins")?,
         led: args.value("--led")?,
         strap: args.value("--strap")?,
+        product_code: args.value("--product-code")?,
     };
     let mut words = args.remaining().into_iter();
     let (Some(name), None) = (words.next(), words.next()) else {
@@ -47,8 +50,9 @@ pub fn run(mut args: Args) -> Outcome {
         println!("  new      {path}");
     }
     println!(
-        "\nNow go through the steps in the new files; docs/porting.md says which test proves each.\n\
-         Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test update main_job::"
+        "\nIts product code is {:08X}h (step 5): bootloader and programs are for this product alone.\nNow go through the steps in the new files; docs/porting.md says which test proves each.\n\
+         Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test update main_job::",
+        new_board::product_code(&name, &choices)?,
     );
     Ok(())
 }

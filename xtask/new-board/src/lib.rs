@@ -21,6 +21,8 @@ pub struct Choices {
     pub pins: Option<String>,
     /// The pin of the LED.
     pub led: Option<String>,
+    /// The product code (1018h/2), `1234` or `0x4D2`; left out, it is made from the name.
+    pub product_code: Option<String>,
     /// The pin of the entry strap, which asks for the bootloader while it is low.
     pub strap: Option<String>,
 }
@@ -31,7 +33,22 @@ pub struct Choices {
 /// # Errors
 /// The mistake, by name.
 pub fn board(name: &str, chip: &str, choices: &Choices) -> Outcome<Vec<(String, String)>> {
-    files(name, &Fit::new(chip_by_name(chip)?, choices)?)
+    files(name, &Fit::new(chip_by_name(chip)?, choices)?, product_code(name, choices)?)
+}
+
+/// The product code of a board. 0 would be any: the programs of two boards would go into each other.
+///
+/// # Errors
+/// The option is no number, or 0.
+pub fn product_code(name: &str, choices: &Choices) -> Outcome<u32> {
+    let Some(word) = &choices.product_code else {
+        return Ok(shared_abi::check_word(&name.bytes().map(u32::from).collect::<Vec<_>>()).max(1));
+    };
+    let number =
+        word.strip_prefix("0x").map_or_else(|| word.parse(), |digits| u32::from_str_radix(digits, 16));
+    number.ok().filter(|code| *code != 0).ok_or_else(|| {
+        format!("--product-code {word}: it takes a number as 1234 or 0x4D2, and not 0, which is any product.")
+    })
 }
 
 fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {
@@ -53,7 +70,7 @@ fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {
 }
 
 /// The files of a board: their paths and contents.
-fn files(name: &str, fit: &Fit) -> Outcome<Vec<(String, String)>> {
+fn files(name: &str, fit: &Fit, product_code: u32) -> Outcome<Vec<(String, String)>> {
     let good = name.starts_with(|c: char| c.is_ascii_lowercase())
         && !name.ends_with('-')
         && !name.contains("--")
@@ -72,9 +89,9 @@ fn files(name: &str, fit: &Fit) -> Outcome<Vec<(String, String)>> {
     let module = name.replace('-', "_");
     let mut files = vec![
         (format!("shared-abi/src/layout/boards/{module}.rs"), layout_file(name, fit.chip)),
-        (format!("bsp/src/boards/{module}.rs"), board_file(name, fit)),
+        (format!("bsp/src/boards/{module}.rs"), board_file(name, fit, product_code)),
     ];
-    files.extend(c_header(name, fit).map(|text| (format!("examples/c/boards/{name}.h"), text)));
+    files.extend(c_header(name, fit, product_code).map(|text| (format!("examples/c/boards/{name}.h"), text)));
     Ok(files)
 }
 
@@ -260,7 +277,7 @@ fn shown((port, number): Pin) -> String {
     format!("P{port}{number}")
 }
 
-fn board_file(name: &str, fit: &Fit) -> String {
+fn board_file(name: &str, fit: &Fit, product_code: u32) -> String {
     let Fit { chip, clocks, wiring: Wiring { can_controller, can, led, strap, uart, .. } } = fit;
     let mhz = clocks.sysclk() / 1_000_000;
     let ClockTree { hse, pll_input, pll_n, pll_p, apb1, apb2, wait_states, .. } = clocks;
@@ -273,6 +290,7 @@ fn board_file(name: &str, fit: &Fit) -> String {
         include_str!("board.txt"),
         &[
             ("name", name),
+            ("product_code", &format!("0x{:04X}_{:04X}", product_code >> 16, product_code & 0xFFFF)),
             ("chip", &constant(chip)),
             ("receive", &shown(can.receive)),
             ("transmit", &shown(can.transmit)),
@@ -301,7 +319,7 @@ fn grouped(hz: u32) -> String {
 }
 
 /// The header for the application in C, which knows one port with alternate function 9 of CAN1.
-fn c_header(name: &str, fit: &Fit) -> Option<String> {
+fn c_header(name: &str, fit: &Fit, product_code: u32) -> Option<String> {
     let Fit { chip, clocks: ClockTree { hse, .. }, wiring: Wiring { can, led, can_controller, .. } } = fit;
     let (port, receive, transmit) = (can.receive.0, can.receive.1, can.transmit.1);
     let is_other = matches!(chip.line, Line::F412 | Line::F413 | Line::F423) && port == 'B';
@@ -312,6 +330,7 @@ fn c_header(name: &str, fit: &Fit) -> Option<String> {
         include_str!("header.txt"),
         &[
             ("name", name),
+            ("product_code", &format!("0x{product_code:08X}")),
             ("module", &name.replace('-', "_")),
             ("port", &port.to_string()),
             ("receive", &receive.to_string()),
@@ -347,7 +366,7 @@ mod tests {
     fn fit(chip: &'static Geometry, words: [&str; 5]) -> Outcome<Fit> {
         let [crystal, can, pins, led, strap] =
             words.map(|word| Some(word.to_owned()).filter(|word| !word.is_empty()));
-        Fit::new(chip, &Choices { crystal, can, pins, led, strap })
+        Fit::new(chip, &Choices { crystal, can, pins, led, strap, product_code: None })
     }
 
     /// All three files together have every step once, in order. Their clocks make each bit rate of CiA 301.
@@ -355,7 +374,7 @@ mod tests {
     fn every_chip_has_clocks_and_pins_and_its_steps_are_numbered_once() {
         for chip in CHIPS {
             let fit = fit(chip, [""; 5]).unwrap_or_else(|error| panic!("{}: {error}", chip.chip));
-            let all: String = files("my-board", &fit).unwrap().into_iter().map(|(_, text)| text).collect();
+            let all: String = files("my-board", &fit, 1).unwrap().into_iter().map(|(_, text)| text).collect();
             let steps: Vec<u32> = all
                 .match_indices("Step ")
                 .filter_map(|(at, _)| all[at + 5..].split(':').next()?.parse().ok())
@@ -371,9 +390,10 @@ mod tests {
     #[test]
     fn the_choices_are_in_the_files() {
         let own = fit(&STM32F446RE, ["25000000", "", "pb13,PB12", "PA2", "PC13"]).unwrap();
-        let files = files("my-board", &own).unwrap();
+        let files = files("my-board", &own, 0x4D2).unwrap();
         assert_eq!(files.len(), 2, "the application in C has no CAN2");
         for line in [
+            "product_code: 0x0000_04D2,",
             "hse: 25_000_000,",
             "pll_input: 1_000_000,",
             "pll_n: 320,",
@@ -388,7 +408,25 @@ mod tests {
         }
         let other = fit(&STM32F446RE, ["4800000", "1", "", "", "PC13"]).unwrap();
         assert_eq!((other.clocks.pll_input, other.wiring.led), (1_600_000, ('A', 5)));
-        assert!(c_header("x", &other).unwrap().contains("HSE_HZ UINT32_C(4800000)"));
+        let header = c_header("x", &other, 0x4D2).unwrap();
+        assert!(
+            header.contains("HSE_HZ UINT32_C(4800000)") && header.contains("UINT32_C(0x000004D2)"),
+            "{header}"
+        );
+    }
+
+    /// 0 would be any product (CiA 302-3 has it so for the identity of a program, as the label here).
+    #[test]
+    fn two_boards_have_two_product_codes_and_neither_is_0() {
+        let code = |name: &str, word: Option<&str>| {
+            product_code(name, &Choices { product_code: word.map(str::to_owned), ..Choices::default() })
+        };
+        let codes = ["an-f405", "an-f413", "my-board"].map(|name| code(name, None).unwrap());
+        assert!(codes[0] != codes[1] && codes[1] != codes[2] && !codes.contains(&0), "{codes:X?}");
+        assert_eq!([code("a", Some("1234")), code("b", Some("0x4D2"))], [Ok(1234), Ok(1234)]);
+        for word in ["0", "0x0", "x", "-1", "4294967296"] {
+            assert!(code("a", Some(word)).unwrap_err().contains("--product-code"), "{word}");
+        }
     }
 
     #[test]
@@ -458,8 +496,8 @@ mod tests {
         let long = "a".repeat(41);
         let fit = fit(&STM32F446RE, [""; 5]).unwrap();
         for name in ["", "My", "1a", "a_b", "a-", "a--b", "../x", "a b", "ä", &long] {
-            assert!(files(name, &fit).unwrap_err().contains("is no name"), "{name}");
+            assert!(files(name, &fit, 1).unwrap_err().contains("is no name"), "{name}");
         }
-        assert!(files("nucleo-f446re", &fit).unwrap_err().contains("already"));
+        assert!(files("nucleo-f446re", &fit, 1).unwrap_err().contains("already"));
     }
 }
