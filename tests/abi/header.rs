@@ -98,6 +98,11 @@ pub fn include() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot")
 }
 
+/// What a program for the chip takes from the header and from the library.
+fn for_the_chip() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../abi/for_the_chip.c")
+}
+
 /// A compiler that takes nothing lightly.
 fn strict(compiler: &str) -> Command {
     let mut compiler = Command::new(compiler);
@@ -196,61 +201,17 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
     }
 }
 
-/// What a program for the chip takes from the header and from the library.
-const FOR_THE_CHIP: &str = r#"
-#include "coboot.h"
-#include "program.h"
-
-COBOOT_LABEL(1, 2, 3);
-
-#ifdef __cplusplus
-extern "C" {
-#endif
-int call(void);
-void leave(void);
-#ifdef __cplusplus
-}
-#endif
-
-int call(void)
-{
-    const struct coboot_callgate *gate = coboot_callgate();
-    struct coboot_handoff handoff;
-    struct coboot_node_args node;
-    struct coboot_program_args program;
-    uint32_t crc;
-    return coboot_read_handoff(&handoff) && coboot_nameplate(&handoff) == NULL && coboot_crc32(gate, 0, 4, &crc) == 0 && coboot_read_node(gate, &node) == 0
-        && coboot_store_node(gate, 1, 125000) == 0 && coboot_program_info(gate, 1, &program) == 0
-        && coboot_confirm(gate, 1) == 0 && coboot_invalidate(gate, 1) == 0 && coboot_unconfirm(gate, 1) == 0;
-}
-
-void leave(void)
-{
-    coboot_reset(COBOOT_REQUEST_STORE_NODE, coboot_stored_node(1, 125000));
-}
-"#;
-
-/// By both compilers, as C and as C++, as freestanding as it gets: the assertions on sizes and
-/// offsets hold there, too. Clang for both float ABIs of the chip.
+/// As C and as C++, as freestanding as it gets: the assertions on sizes and offsets hold there, too. For both
+/// float ABIs of the chip; `by_gcc.rs` does the same with the other compiler.
 #[test]
 fn it_compiles_for_the_chip() {
-    let gcc = |name: &str| {
-        let mut gcc = strict(name);
-        gcc.arg("-mthumb");
-        gcc
-    };
-    let clang = |target: &str| {
-        let mut clang = clang();
-        clang.arg(format!("--target={target}"));
-        clang
-    };
-    for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
-        let folder = kit::folder!("header");
-        let source = folder.write(format!("chip.{extension}"), FOR_THE_CHIP);
-        let name = if extension == "c" { "arm-none-eabi-gcc" } else { "arm-none-eabi-g++" };
-        for mut compiler in [clang("thumbv7em-none-eabihf"), clang("thumbv7em-none-eabi"), gcc(name)] {
-            compiler.args(["-mcpu=cortex-m4", "-ffreestanding", "-Os", standard, "-c"]);
-            succeed(compiler.arg(&source).arg("-o").arg(folder.join("chip.o")));
+    let folder = kit::folder!("header-for-the-chip");
+    for language in [["-xc", "-std=c11"], ["-xc", "-std=gnu17"], ["-xc++", "-std=c++17"]] {
+        for target in ["thumbv7em-none-eabihf", "thumbv7em-none-eabi"] {
+            let mut clang = clang();
+            clang.arg(format!("--target={target}")).args(language);
+            clang.args(["-mcpu=cortex-m4", "-ffreestanding", "-Os", "-c"]).arg(for_the_chip());
+            succeed(clang.arg("-o").arg(folder.join("chip.o")));
         }
     }
 }
