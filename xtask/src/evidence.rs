@@ -74,7 +74,7 @@ pub fn run(mut args: Args) -> Outcome {
 
 fn write(file: &Path, text: &str) -> Outcome {
     files::write(file, text)?;
-    println!("{} is written.", workspace::shown(file));
+    eprintln!("{} is written.", workspace::shown(file));
     Ok(())
 }
 

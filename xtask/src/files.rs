@@ -55,7 +55,7 @@ pub fn lock(name: &str, busy: &str) -> Outcome<File> {
     let file = File::options().create(true).truncate(false).write(true).open(&path);
     let file = file.map_err(failed("locked", &path))?;
     if file.try_lock().is_err() {
-        println!("{busy} This one waits for its end; Ctrl-C gives up.");
+        eprintln!("{busy} This one waits for its end; Ctrl-C gives up.");
         file.lock().map_err(failed("locked", &path))?;
     }
     Ok(file)

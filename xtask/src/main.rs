@@ -189,6 +189,24 @@ mod tests {
         }
     }
 
+    /// The standard output is the job's: what it prints may be JSON for a program (`cargo xtask bench --json`). What
+    /// every job does on its way, such as building, installing and keeping a record, is told on the standard error.
+    #[test]
+    fn only_a_job_itself_prints_on_the_standard_output() {
+        for name in
+            "args build elf evidence files outcome process product ram_image setup toolchain workspace"
+                .split(' ')
+        {
+            let text = files::ours(format!("xtask/src/{name}.rs")).unwrap();
+            let (before, job) = text.split_once("\npub fn run(").unwrap_or((&text, ""));
+            let (_, after) = job.split_once("\n}\n").unwrap_or_default();
+            for line in before.lines().chain(after.lines()) {
+                let prints = ["print!(", "println!("].iter().any(|word| line.trim_start().starts_with(word));
+                assert!(!prints, "{name}: {line}");
+            }
+        }
+    }
+
     #[test]
     fn a_newcomer_sees_eight_jobs() {
         let first: Vec<_> = JOBS[..FIRST].iter().map(|job| job.name).collect();

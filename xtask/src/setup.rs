@@ -109,7 +109,7 @@ fn install(parts: &[Part]) -> Outcome {
              (or add --yes, and it is run for you.)"
         ));
     }
-    println!("Installing {} ...", missing.join(", "));
+    eprintln!("Installing {} ...", missing.join(", "));
     let apt_get = |words: &[&str]| {
         let mut command = Command::new(if root { "env" } else { "sudo" });
         command.args((!root).then_some("env")).args(["DEBIAN_FRONTEND=noninteractive", "apt-get"]);
@@ -240,7 +240,7 @@ pub fn tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
     let tools = workspace::target_dir().join("tools");
     let program = tools.join("bin").join(name);
     if !program.exists() {
-        println!("Installing {name} {version} into {} ...", workspace::shown(&tools));
+        eprintln!("Installing {name} {version} into {} ...", workspace::shown(&tools));
     }
     // cargo does nothing where this version is there.
     let mut install = process::bare_cargo();
@@ -294,7 +294,7 @@ fn python_environment() -> Outcome {
         return Ok(());
     }
     let home = workspace::target_dir().join("python");
-    println!("Making a Python environment in {} ...", workspace::shown(&home));
+    eprintln!("Making a Python environment in {} ...", workspace::shown(&home));
     process::run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&home))?;
     process::run(
         Command::new(python())

@@ -40,7 +40,7 @@ pub fn check(line: &str) -> Outcome {
 /// Says so if this is another compiler than that of a release.
 pub fn notice() {
     if let Err(other) = check(&line()) {
-        println!("\nnote: {other}");
+        eprintln!("\nnote: {other}");
     }
 }
 
