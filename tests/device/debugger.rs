@@ -640,6 +640,19 @@ fn coflash_debug_reads_writes_breaks_and_continues() {
     assert_eq!(endpoint.bench.events(), [], "no reset");
 }
 
+/// The session of the page, line by line; the address of the function is that of this build.
+#[test]
+fn the_pages_session_goes_as_printed() {
+    let page = include_str!("../../docs/debugger.md");
+    let mut endpoint = Endpoint::new(application());
+    for line in page.lines().filter_map(|line| line.strip_prefix("$ coflash more debug ")) {
+        let line = line.replace("0x08020CF4", &format!("{:#010x}", symbol("debugger_example")));
+        let (code, _, err) = debug(&mut endpoint, &line.split(' ').collect::<Vec<_>>());
+        assert_eq!(code, Some(0), "{line}: {err}");
+    }
+    assert_eq!(endpoint.bench.events(), [], "no reset");
+}
+
 /// The firmware of a product, and a bootloader.
 #[test]
 fn coflash_debug_tells_what_a_device_lacks() {

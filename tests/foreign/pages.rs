@@ -3,7 +3,7 @@
 //!
 //! | comment in front of a block | what it says |
 //! |---|---|
-//! | `not run: REASON` | it does not run, for a reason of [`REASONS`]. `elsewhere: FILE` names the test that runs it |
+//! | `not run: REASON` | it does not run, for a reason of [`REASONS`]. `elsewhere: FILE` names the test that runs it: the file has its lines, or reads them from the page |
 //! | `bus: PROGRAM OPTIONS` | from here on the commands find this device: `coboot-node` or `emulate` |
 //! | `first: COMMAND` | what the page assumes to be there, such as a file of the reader's |
 //! | `file: NAME` | the block is the content of this file |
@@ -12,7 +12,7 @@
 //!
 //! The commands are those of the page, with the programs of this build: `cargo run -p coflash --` is
 //! `coflash`, and `cargo xtask emulate` is the emulator with the images that `cargo xtask build` has
-//! made before. The port 29536 of the pages is a free one.
+//! made before. The port 29536 of the pages is a free one, and `/dev/pts/5` the terminal that the emulator has named.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -61,7 +61,14 @@ macro_rules! pages {
 pages! {
     readme "README.md"
     application "docs/application.md"
+    can_over_uart "docs/can-over-uart.md"
     coflash "docs/coflash.md"
+    debugger "docs/debugger.md"
+    example_c "examples/c/README.md"
+    example_cpp "examples/cpp/README.md"
+    example_embassy "examples/embassy/README.md"
+    example_no_stack "examples/no-stack/README.md"
+    example_rtic "examples/rtic/README.md"
     conform "docs/conform.md"
     first_hour "docs/first-hour.md"
     fleet "docs/fleet.md"
@@ -72,7 +79,9 @@ pages! {
     product "docs/product.md"
     renewal "docs/renewal.md"
     security "docs/security.md"
+    service "docs/service.md"
     testing "docs/testing.md"
+    ui "docs/ui.md"
     node_readme "sim/node/README.md"
 }
 
@@ -112,7 +121,7 @@ impl Block {
     /// The block neither runs nor has a mark.
     fn kind(&self) -> Result<Kind, String> {
         if let Some(mark) = self.comment("not run: ") {
-            return marked(mark).map(Kind::Marked).map_err(|error| format!("{}: {error}", self.place));
+            return self.marked(mark).map(Kind::Marked).map_err(|error| format!("{}: {error}", self.place));
         }
         if let Some(name) = self.comment("file: ") {
             return Ok(Kind::File(name.to_owned()));
@@ -126,6 +135,43 @@ impl Block {
             _ if self.comment("from ").is_some() || self.is_of_a_crate() => Ok(Kind::Compiled),
             other => Err(format!("{}: {other} neither runs nor has a mark", self.place)),
         }
+    }
+
+    /// The reason of a mark in front of it.
+    fn marked(&self, mark: &str) -> Result<&'static str, String> {
+        let (reason, file) =
+            mark.split_once(": ").map_or((mark, None), |(reason, file)| (reason, Some(file)));
+        let known = REASONS.into_iter().find(|known| *known == reason);
+        let known =
+            known.ok_or_else(|| format!("\"{reason}\" is no reason; there are: {}", REASONS.join(", ")))?;
+        match (known, file) {
+            ("elsewhere", file) => {
+                let source = fs::read_to_string(root().join(file.unwrap_or_default()));
+                let source =
+                    source.map_err(|_| format!("\"{mark}\" names no file of a test that runs it"))?;
+                let missing = self.missing_from(&source);
+                missing.map_or(Ok(known), |line| Err(format!("\"{mark}\" does not have the line: {line}")))
+            }
+            (_, None) => Ok(known),
+            (_, Some(_)) => Err(format!("\"{mark}\": only \"elsewhere\" names a file")),
+        }
+    }
+
+    /// The first line that a test neither has, word for word, nor reads from the page: then it names the page, and cuts
+    /// the block out, or finds commands by their first words.
+    fn missing_from(&self, source: &str) -> Option<String> {
+        let page = self.place.split(':').next().unwrap_or_default();
+        let is_command = ["", "sh", "console"].contains(&&*self.language);
+        let mut texts = source.split('"').filter(|text| text.trim().len() > 8 && text.trim().contains(' '));
+        let finds =
+            if is_command { texts.any(|text| self.code.contains(text)) } else { source.contains("```") };
+        if finds && source.contains(page) {
+            return None;
+        }
+        let (prompted, source) =
+            (prompted(&self.code), source.lines().map(words).collect::<Vec<_>>().join(" "));
+        let mut lines = if prompted.is_empty() { &self.code } else { &prompted }.lines();
+        lines.find(|line| !format!(" {source} ").contains(&format!(" {} ", words(line)))).map(str::to_owned)
     }
 
     /// What the comments in front of it ask for, in their order.
@@ -156,18 +202,17 @@ impl Block {
     }
 }
 
-/// The reason of a mark.
-fn marked(mark: &str) -> Result<&'static str, String> {
-    let (reason, file) = mark.split_once(": ").map_or((mark, None), |(reason, file)| (reason, Some(file)));
-    let known = REASONS.into_iter().find(|known| *known == reason);
-    let known =
-        known.ok_or_else(|| format!("\"{reason}\" is no reason; there are: {}", REASONS.join(", ")))?;
-    match (known, file) {
-        ("elsewhere", Some(file)) if root().join(file).is_file() => Ok(known),
-        ("elsewhere", _) => Err(format!("\"{mark}\" does not name the file of the test that runs it")),
-        (_, None) => Ok(known),
-        (_, Some(_)) => Err(format!("\"{mark}\": only \"elsewhere\" names a file")),
-    }
+/// The words of a line, without what only a language puts around them, its comment, and the program that it calls: a
+/// test calls that by its path.
+fn words(line: &str) -> String {
+    let line = line.split(" #").next().and_then(|line| line.split("//").next()).unwrap_or(line).trim();
+    let line = ["coflash ", "cargo xtask "]
+        .into_iter()
+        .find_map(|program| line.strip_prefix(program))
+        .unwrap_or(line);
+    let is_between = |c: char| !c.is_alphanumeric() && !"_./:=@-".contains(c);
+    let words: Vec<_> = line.split(is_between).filter(|word| !word.is_empty()).collect();
+    words.join(" ")
 }
 
 /// The commands after `$ `, with the lines that continue them.
@@ -276,6 +321,7 @@ const SHELL: &str = r#"
 set -e
 server=
 own=
+terminal=
 stop() { [ -z "$1" ] || { kill "$1"; wait "$1" || true; } }
 trap 'stop "$server"; stop "$own"' EXIT
 reached() {
@@ -288,7 +334,15 @@ serve() {
     stop "$server"
     "$@" > page.served 2>&1 &
     server=$!
-    [[ "$*" =~ 127\.0\.0\.1:([0-9]+) ]] && reached "$server" "${BASH_REMATCH[1]}"
+    if [[ "$*" =~ 127\.0\.0\.1:([0-9]+) ]]; then
+        reached "$server" "${BASH_REMATCH[1]}"
+        return
+    fi
+    until grep -q -e '/dev/pts/' -e 'http://127' page.served; do
+        kill -0 "$server" || { cat page.served; exit 1; }
+        sleep 0.05
+    done
+    terminal=$(grep -o '/dev/pts/[0-9]*' page.served || true)
 }
 bus() {
     stop "$own"
@@ -302,13 +356,18 @@ bus() {
     own=$!
     reached "$own" "$OWN"
 }
-coflash() { "$COBOOT_COFLASH" "$@" < /dev/null; }
+coflash() {
+    set -- "${@//\/dev\/pts\/5@/$terminal@}"
+    if [ "$1" = ui ]; then serve "$COBOOT_COFLASH" "$@" < /dev/null; else "$COBOOT_COFLASH" "$@" < /dev/null; fi
+}
 coboot-node() { serve "$COBOOT_NODE" "$@"; }
 built() { for image in "$@"; do [ -e "target/firmware/stm32f407g-disc1/$image.elf" ]; done; }
 cargo() {
     case "$*" in
     "run -p coflash -- "*) coflash "${@:5}" ;;
     "run -p coboot-node -- "*) coboot-node "${@:5}" ;;
+    "xtask emulate --virtual-can") serve "$EMULATE" --serial pty \
+        --bootloader target/firmware/stm32f407g-disc1/bootloader-virtual-can.elf ;;
     "xtask emulate "*) serve "$EMULATE" --bootloader target/firmware/stm32f407g-disc1/bootloader.elf --speed max "${@:3}" ;;
     "xtask build"*) built "${@:3}" ;;
     "xtask layout"*) "$XTASK" "${@:2}" ;;
@@ -323,7 +382,8 @@ fn reader(page: &str) -> Folder {
     let folder = kit::folder!(&format!("pages-{}", page.replace(['/', '.'], "-")));
     let images = firmware::dir();
     let own = [("app.elf", "app-v1.elf")];
-    let same = ["app-v1.elf", "app-v2.elf", "bootloader.elf", "bootloader-sealed.elf"];
+    let same =
+        "app-v1.elf app-v2.elf bootloader.elf bootloader-sealed.elf bootloader-watchdog.elf".split(' ');
     for (name, image) in own.into_iter().chain(same.map(|name| (name, name))) {
         fs::copy(images.join(image), folder.join(name)).unwrap_or_else(|error| panic!("{image}: {error}"));
     }
@@ -469,6 +529,13 @@ fn a_block_without_a_reason_is_found() {
     assert_eq!(kind("<!-- not run: root -->\n\n```sh\na\n```\n"), Ok(Kind::Marked("root")));
     assert_eq!(kind("<!-- not run: elsewhere: README.md -->\n```js\n```\n"), Ok(Kind::Marked("elsewhere")));
     assert_eq!(kind("<!-- file: a.toml -->\n```toml\na\n```\n"), Ok(Kind::File("a.toml".to_owned())));
+    let elsewhere = |line: &str| {
+        kind(&format!("<!-- not run: elsewhere: tests/foreign/pages.rs -->\n```sh\n{line}\n```\n"))
+    };
+    assert_eq!(elsewhere("coflash \"$@\" # words of this file"), Ok(Kind::Marked("elsewhere")));
+    assert!(elsewhere(&format!("coflash --nev{}", "er --typed"))
+        .unwrap_err()
+        .contains("does not have the line"));
     // A mark holds for the block right behind it.
     assert_eq!(kind("<!-- not run: root -->\nwords\n```sh\na\n```\n"), Ok(Kind::Commands("a\n".to_owned())));
     for wrong in [

@@ -1,9 +1,11 @@
 //! The Python package (`coflash/python/`): its wheel is built and installed like a user's, its own tests
 //! run against `coboot-node` over TCP, and it updates the emulated sealed board.
 
+use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::LazyLock;
+use std::time::Duration;
 use std::{env, fs};
 
 use canopen::program::ProgramControl;
@@ -72,6 +74,34 @@ fn the_wheel_is_built_installed_and_passes_its_tests() {
     let tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider"];
     let said = done(with_package().args(tests).arg(source().join("tests")).env("COBOOT_NODE", node));
     assert!(said.contains(" passed") && !said.contains("skipped"), "{said}");
+    the_pages_scripts_run(node);
+}
+
+/// The scripts of the pages, as printed but for the bus, on a node with their node-ID.
+fn the_pages_scripts_run(node: &str) {
+    let folder = kit::folder!("python-pages");
+    fs::copy(firmware::dir().join("app-v1.elf"), folder.join("app.elf")).expect("the application");
+    let at = TcpListener::bind("127.0.0.1:0").and_then(|free| free.local_addr()).expect("a port").to_string();
+    let mut node = Command::new(node);
+    node.args(["--node", "5", "--flash", "instant", "--stand-in", "--listen", &at, "--folder"]).arg(&*folder);
+    let mut node = node.spawn().expect("the node starts");
+    while TcpStream::connect(&at).is_err() {
+        assert!(node.try_wait().expect("its state").is_none(), "the node has ended");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let run = |page: &str| {
+        let page = fs::read_to_string(root().join(page)).expect("the page");
+        let script =
+            page.split("```python\n").find(|block| block.starts_with("import coflash\n")).expect("a script");
+        let script = script.split("```").next().unwrap_or_default();
+        let script = script.replace("socketcan:can0", &format!("socketcand://{at}/can0"));
+        with_package().current_dir(&*folder).arg("-c").arg(script).output().expect("Python starts")
+    };
+    let outputs = ["coflash/python/README.md", "docs/coflash.md"].map(run);
+    node.kill().and_then(|()| node.wait()).expect("it ends");
+    for output in outputs {
+        println!("{}", succeeded(&output));
+    }
 }
 
 /// The script of a test bench: one line for each file, with the number of the error.

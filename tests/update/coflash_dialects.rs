@@ -3,8 +3,9 @@
 
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::firmware;
+use coboot_tests::endpoint::Endpoint;
 use coboot_tests::renewal::{plain, version as version_of};
+use coboot_tests::{firmware, tools};
 use coflash_core::device::{recognise, Dialect, Doing};
 use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Format};
@@ -168,5 +169,24 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Unlock, .. })), "{result:?}");
     assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it goes on");
-    bench.assert_nothing_unmodelled();
+    bench.run_ms(PENALTY_MS);
+
+    // The lines of the page, but for node-ID and password.
+    let folder = kit::folder!("lift-of-the-page");
+    std::fs::write(folder.join("app.elf"), firmware::elf(&firmware::of_board(layout.board, APP_LIFT)))
+        .unwrap();
+    let mut endpoint = Endpoint::new(bench);
+    let page =
+        include_str!("../../docs/coflash.md").lines().filter_map(|line| line.strip_prefix("$ coflash "));
+    let lines: Vec<_> =
+        page.filter(|line| line.ends_with("--unlock opensesame") || line.contains("opensesame -o")).collect();
+    assert_eq!(lines.len(), 4, "{lines:?}");
+    for line in lines {
+        let line = line.replace("--node 5", &format!("--node {NODE}")).replace("opensesame", PASSWORD);
+        let mut command = tools::coflash();
+        command.args(line.split(' ')).env("COFLASH_BUS", endpoint.url()).current_dir(&*folder);
+        println!("{line}: {}", endpoint.succeed(&mut command));
+    }
+    assert_eq!(std::fs::read(folder.join("set.bin")).unwrap(), set);
+    endpoint.bench.assert_nothing_unmodelled();
 }

@@ -468,6 +468,12 @@ mod tests {
             let why = read(&text).unwrap_err();
             assert!(why.contains(words), "{text}: {why}");
         }
+        // The example of the page, with its files.
+        std::fs::write(folder.join("gateway.token"), "t").unwrap();
+        let page = include_str!("../../../docs/agent.md");
+        let example = page.split("```toml\n").nth(1).and_then(|block| block.split("```").next()).unwrap();
+        let config = Config::read(example, &folder, (None, None), &|_| Some("t".to_string())).unwrap();
+        assert_eq!(config.targets.len(), 4);
         std::fs::remove_dir_all(&folder).unwrap();
     }
 
