@@ -163,4 +163,14 @@ pub mod tests {
         assert_eq!(problem, "it needs 40 bytes of flash at 0x08000000, and has 39: 1 too many.");
         assert!(super::used(&[], &[Region::new(0x0800_0000, 0x27)]).unwrap_err().contains("nothing"));
     }
+
+    #[test]
+    fn a_label_is_found_where_the_bootloader_looks_for_it() {
+        let region = Region::new(0x0802_0000, 0x1000);
+        let mut bytes = vec![0xFF; 0x200];
+        bytes[label::OFFSET as usize..].copy_from_slice(&Label::new(1, 0, 3).emit());
+        let at = |address| label(&[Segment { offset: 0, address, bytes: &bytes }], region);
+        assert_eq!(at(region.base), Some(Label::new(1, 0, 3)));
+        assert_eq!([region.base + 4, region.base + 0x1000, 0].map(at), [None; 3]);
+    }
 }

@@ -270,13 +270,14 @@ fn note_moment(uc: &mut Unicorn<'_, State>, access: Access, address: u32) {
 /// piece, each with its cycles: the loop is where it would be. The host needs more time for them than the chip, and its
 /// clients would wait.
 fn skip_rounds(uc: &mut Unicorn<'_, State>) {
-    let core = [RegisterARM::LR, RegisterARM::SP, RegisterARM::PC, RegisterARM::XPSR].map(|it| read(uc, it));
-    let general = std::array::from_fn(|n| uc.reg_read(RegisterARM::R0 as i32 + n as i32).unwrap_or(0) as u32);
     let State { chip, notes } = uc.get_data_mut();
     if chip.flash.busy_until().is_none() || notes.single {
         notes.poll = None;
         return;
     }
+    let core = [RegisterARM::LR, RegisterARM::SP, RegisterARM::PC, RegisterARM::XPSR].map(|it| read(uc, it));
+    let general = std::array::from_fn(|n| uc.reg_read(RegisterARM::R0 as i32 + n as i32).unwrap_or(0) as u32);
+    let State { chip, notes } = uc.get_data_mut();
     let mut poll = Poll { entry: chip.slice.entries, cycles: chip.clock.cycles, core, general };
     if let Some(before) = notes.poll.filter(|before| Poll { cycles: poll.cycles, ..*before } == poll) {
         let round = (poll.cycles - before.cycles).max(1);
