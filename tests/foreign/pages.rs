@@ -533,9 +533,7 @@ fn a_block_without_a_reason_is_found() {
         kind(&format!("<!-- not run: elsewhere: tests/foreign/pages.rs -->\n```sh\n{line}\n```\n"))
     };
     assert_eq!(elsewhere("coflash \"$@\" # words of this file"), Ok(Kind::Marked("elsewhere")));
-    assert!(elsewhere(&format!("coflash --nev{}", "er --typed"))
-        .unwrap_err()
-        .contains("does not have the line"));
+    assert!(elsewhere(&format!("coflash --nev{}", "er")).unwrap_err().contains("does not have the line"));
     // A mark holds for the block right behind it.
     assert_eq!(kind("<!-- not run: root -->\nwords\n```sh\na\n```\n"), Ok(Kind::Commands("a\n".to_owned())));
     for wrong in [

@@ -168,7 +168,7 @@ fn a_board_is_made_as_the_guide_says() {
 fn boards_with_other_crystals_are_emulated_by_their_names() {
     let copy = Copy::new();
     let boards =
-        ["a-12 STM32F405RGT6 12000000 1", "b-16 STM32F446RET6 16000000 2", "c-25 STM32F413RHT6 25000000 1"];
+        ["a-12 STM32F405RGT6 12000000 1", "b-16 STM32F405VGT6 16000000 2", "c-25 STM32F405ZGT6 25000000 1"];
     let boards = boards.map(|words| words.split(' ').collect::<Vec<_>>());
     for board in &boards {
         let [name, chip, crystal, can] = board[..] else { panic!("{board:?}") };
