@@ -1,9 +1,17 @@
 //! Between the slave and the CAN controller.
 
 use bsp::{line, CanPort};
-use canopen::slave::{Slave, SlaveDevice};
-use canopen::Instant;
+use canopen::slave::{Output, Slave, SlaveDevice};
+use canopen::{CobId, Instant};
 use rtic::Mutex;
+
+use crate::entries::RECEIVE;
+use crate::process::OWN;
+
+/// The identifiers that the slave accepts.
+const OF_SLAVE: usize = 4;
+/// With SYNC, and those of the application.
+const IDENTIFIERS: usize = OF_SLAVE + 1 + RECEIVE.len() + OWN.len();
 
 /// Carries out the slave's actions until there are none left.
 pub fn carry_out(
@@ -13,6 +21,17 @@ pub fn carry_out(
     device: &mut impl SlaveDevice,
 ) {
     while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), device) {
-        can.lock(|can| line::carry_out(can, output));
+        can.lock(|can| match output {
+            Output::Accept(ids) => can.accept(identifiers(ids, device)),
+            output => line::carry_out(can, output),
+        });
     }
+}
+
+/// All identifiers to accept; the first one again in the place of a PDO that does not exist.
+fn identifiers(of_slave: [CobId; OF_SLAVE], device: &mut impl SlaveDevice) -> [u16; IDENTIFIERS] {
+    core::array::from_fn(|n| {
+        let own = || device.exchange()?.identifier(n - OF_SLAVE);
+        of_slave.get(n).copied().or_else(own).unwrap_or(of_slave[0]).get()
+    })
 }

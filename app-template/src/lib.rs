@@ -8,3 +8,5 @@ pub mod bus;
 pub mod entries;
 #[cfg(target_arch = "arm")]
 pub mod objects;
+#[cfg(target_arch = "arm")]
+pub mod process;

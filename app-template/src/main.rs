@@ -3,8 +3,9 @@
 //! | file | what to do with it |
 //! |---|---|
 //! | `main.rs` | wiring of the tasks: put your own beside them |
-//! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
-//! | `objects.rs` | the values of the object dictionary, `may_leave`, and the callback `start_bootloader` |
+//! | `entries.rs` | the table of the object dictionary: add your objects and PDOs; keep 1F51h, 1F56h and 1F57h |
+//! | `process.rs` | the values of your objects, what the machine does, `may_leave`, and frames of your own |
+//! | `objects.rs` | the values of the other objects, and the callback `start_bootloader` |
 //! | `bus.rs` | nothing: it carries out what the slave asks of the CAN controller |
 //! | `Cargo.toml` | the version of the application |
 //!

@@ -1,26 +1,30 @@
 //! The values of the application's object dictionary. The values of 1F51h, 1F56h and 1F57h come
-//! from `coboot-app`, which also decides when the device goes back to its bootloader.
+//! from `coboot-app`, which also decides when the device goes back to its bootloader; those of the
+//! process from `process.rs`.
 
-use core::sync::atomic::{AtomicU8, Ordering::SeqCst};
+use core::sync::atomic::Ordering::SeqCst;
 use core::task::Poll;
 
 use bsp::{line, IDENTITY, LAYOUT, NODE_ID};
 use canopen::device::Device;
-use canopen::emcy::Emcy;
+use canopen::emcy::{register, Emcy};
 use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
+use canopen::nmt::NmtState;
 use canopen::node::{self, NmtPolicy};
-use canopen::od::{put, Address, Entry, Objects, Reply};
+use canopen::od::{put, Address, Entry, Exchange, Objects, Reply};
+use canopen::pdo::Pdos;
 use canopen::program::{Numbers, PROGRAM_CONTROL};
 use canopen::sdo::server::Config as SdoConfig;
 use canopen::slave::{self, Slave, SlaveDevice};
-use canopen::{AbortCode, BitRate, Instant, NodeId};
+use canopen::{AbortCode, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_app::nameplate::Nameplate;
 use coboot_app::rules::Command;
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{Bootloader, Defaults, Next, ProgramControl, Start};
 
-use crate::entries::{entries, entry_count, numbers};
+use crate::entries::{entries, entry_count, numbers, RECEIVE, TRANSMIT};
+use crate::process::{may_leave, Process, LEAVES, MACHINE, OWN};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h shows a host that the
 /// application runs.
@@ -45,25 +49,6 @@ static ENTRIES: [Entry; entry_count(NUMBERS)] = entries(NUMBERS).entries();
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
 
-/// What the machine does: it stands, it moves, or it stands because the device leaves. What moves
-/// starts by a `compare_exchange` from `STANDS` to `MOVES`, in whatever task, and not at all if
-/// that fails: the question below and the start exclude each other.
-pub static MACHINE: AtomicU8 = AtomicU8::new(STANDS);
-/// See [`MACHINE`].
-pub const STANDS: u8 = 0;
-/// See [`MACHINE`].
-pub const MOVES: u8 = 1;
-/// See [`MACHINE`].
-pub const LEAVES: u8 = 2;
-
-/// Whether the device may leave now, for its bootloader or for a reset. It is asked once, before a
-/// command is answered or left to the bootloader: 1F51h = 80h, 0, 2 and 3, and what a sealed
-/// program stores. After a no the command is refused (08000022h), and the program stays. A yes is
-/// final: the reset follows within half a second, and until then the machine does not start.
-fn may_leave() -> bool {
-    MACHINE.compare_exchange(STANDS, LEAVES, SeqCst, SeqCst).is_ok()
-}
-
 /// The application's state that is visible on the bus.
 pub struct Application {
     device: Device,
@@ -73,6 +58,8 @@ pub struct Application {
     /// The time of the last call of [`Self::set_time`].
     now: Instant,
     emcy: Emcy,
+    pdos: Pdos<{ RECEIVE.len() }, { TRANSMIT.len() }>,
+    process: Process,
     /// Node-ID in force.
     id: Option<NodeId>,
     /// Bit rate that the device came up with.
@@ -131,6 +118,8 @@ impl Application {
             now: Instant::from_millis(0),
             bit_rate: BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE),
             emcy: Emcy::new(),
+            pdos: Pdos::new(&RECEIVE, &TRANSMIT),
+            process: Process,
             id: start.node_id.and_then(NodeId::new),
         }
     }
@@ -176,8 +165,11 @@ impl Objects for Application {
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
         }
-        if let Some(read) = self.device.read(at, buf) {
+        if let Some(read) = self.device.read(at, buf).or_else(|| self.pdos.read(at, buf)) {
             return read;
+        }
+        if self.process.has(at) {
+            return self.process.read(at, buf);
         }
         match self.control.read(at.index, at.sub, &mut self.bootloader) {
             Some(value) => put(buf, &value?),
@@ -189,15 +181,21 @@ impl Objects for Application {
         match (at.index, data) {
             (PROGRAM_CONTROL, &[START_BOOTLOADER]) => self.start_bootloader(at.sub, expedited),
             (PROGRAM_CONTROL, value) => self.command(at.sub, value, expedited),
+            _ if self.process.has(at) => self.process.write(at, data).map(|()| Reply::Send),
             _ => {
-                let written = self.emcy.write(at, data).unwrap_or(Err(AbortCode::UNSUPPORTED_ACCESS));
-                written.map(|()| Reply::Send)
+                let written = self.emcy.write(at, data);
+                let written = written.or_else(|| self.pdos.write(at, data, &ENTRIES, &self.process));
+                written.unwrap_or(Err(AbortCode::UNSUPPORTED_ACCESS)).map(|()| Reply::Send)
             }
         }
     }
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         self.emcy.next_message()
+    }
+
+    fn exchange(&mut self) -> Option<&mut dyn Exchange> {
+        Some(self)
     }
 }
 
@@ -225,6 +223,42 @@ impl SlaveDevice for Application {
 
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
+        self.pdos.reset(id);
         self.control.node_id_changed(id.map(NodeId::get));
+    }
+}
+
+impl Exchange for Application {
+    fn state_changed(&mut self, state: NmtState) {
+        self.pdos.state_changed(state);
+        self.process.state_changed(state);
+    }
+
+    fn handle(&mut self, frame: &Frame) {
+        if let Some(code) = self.pdos.handle(frame, &mut self.process) {
+            let is_passive = self.emcy.register() & register::COMMUNICATION != 0;
+            self.emcy.raise(code, register::COMMUNICATION, [0; 5]);
+            if !is_passive {
+                // The frame is over.
+                self.emcy.clear(register::COMMUNICATION);
+            }
+        }
+        self.process.handle(frame);
+    }
+
+    fn poll(&mut self, now: Instant) -> Option<Frame> {
+        // The way out must not wait for a bus that is full of PDOs.
+        if self.control.leaving() {
+            return None;
+        }
+        self.pdos.poll(now, &mut self.process)
+    }
+
+    fn identifier(&self, place: usize) -> Option<CobId> {
+        self.pdos.identifiers().chain(OWN).nth(place)
+    }
+
+    fn identifiers_changed(&mut self) -> bool {
+        self.pdos.identifiers_changed()
     }
 }

@@ -140,7 +140,7 @@ impl<I: Controller> Port<I> {
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
     /// FIFO 0. The other controller's filters stay as they are.
-    pub fn accept(&mut self, [a, b, c, d]: [u16; 4]) {
+    pub fn accept<const N: usize>(&mut self, identifiers: [u16; N]) {
         let change = |offset: usize, clear: u32, set: u32| {
             // SAFETY: the offset is one of a register above, in the registers of the master. Only
             // the bits of this controller change, which this port owns.
@@ -153,18 +153,23 @@ impl<I: Controller> Port<I> {
         };
         let border = change(FMR, 0, FINIT) >> 8 & 31;
         let from_border = u32::MAX << border;
-        let (bank, share) = if I::IS_SLAVE { (border, from_border) } else { (0, !from_border) };
+        let (first, share) = if I::IS_SLAVE { (border, from_border) } else { (0, !from_border) };
         change(FA1R, share, 0);
-        // A list of four identifiers of 16 bits each; one of them may appear twice. STID is at
+        // A list of four identifiers of 16 bits in each bank; one of them may appear twice. STID is at
         // 15:5, and RTR and IDE are clear.
-        change(FM1R, 0, 1 << bank);
-        change(FS1R, 1 << bank, 0);
-        change(FFA1R, 1 << bank, 0);
+        let banks = ((1 << N.div_ceil(4)) - 1) << first;
+        change(FM1R, 0, banks);
+        change(FS1R, banks, 0);
+        change(FFA1R, banks, 0);
         let pair = |low: u16, high: u16| u32::from(low) << 5 | u32::from(high) << 21;
-        let words = F0R1 + 8 * bank as usize;
-        change(words, u32::MAX, pair(a, b));
-        change(words + 4, u32::MAX, pair(c, d));
-        change(FA1R, 0, 1 << bank);
+        for bank in 0..N.div_ceil(4) {
+            // By place, and not by chunk: this loop is none where there are four identifiers.
+            let id = |n: usize| *identifiers.get(4 * bank + n).unwrap_or(&identifiers[0]);
+            let words = F0R1 + 8 * (first as usize + bank);
+            change(words, u32::MAX, pair(id(0), id(1)));
+            change(words + 4, u32::MAX, pair(id(2), id(3)));
+        }
+        change(FA1R, 0, banks);
         change(FMR, FINIT, 0);
     }
 

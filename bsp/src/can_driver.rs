@@ -21,7 +21,7 @@ pub trait CanDriver {
 
     /// Receives the data frames with exactly these identifiers of 11 bits from now on, and no others.
     /// One may come twice. None is received before.
-    fn accept(&mut self, identifiers: [u16; 4]);
+    fn accept<const N: usize>(&mut self, identifiers: [u16; N]);
 
     /// The oldest frame that was received, `None` if there is none.
     fn receive(&mut self) -> Option<Frame>;

@@ -28,7 +28,7 @@ macro_rules! is_a_can_driver {
             }
 
             #[inline(always)]
-            fn accept(&mut self, identifiers: [u16; 4]) {
+            fn accept<const N: usize>(&mut self, identifiers: [u16; N]) {
                 self.accept(identifiers);
             }
 

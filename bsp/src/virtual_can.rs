@@ -20,12 +20,15 @@ static RECEIVED: Inbox<256> = Inbox::new();
 static TO_SEND: Ring<512> = Ring::new();
 /// The room that answers leave for frames: a host with endless commands cannot silence the device.
 const FOR_FRAMES: usize = 4 * FRAME_TEXT;
+/// The most identifiers that are received, as many as in four filter banks of bxCAN. A program always
+/// sets the same number of them; no frame has the others.
+const IDENTIFIERS: usize = 16;
 
 /// The UART, and the adapter on it.
 pub struct Port {
     uart: uart::Port<UartController>,
     slcan: Slcan,
-    accepted: Option<[u16; 4]>,
+    accepted: [u16; IDENTIFIERS],
     lost: Lost,
     /// Whether a good frame came since the previous call.
     heard: bool,
@@ -37,7 +40,7 @@ impl Port {
         let mut port = Self {
             uart,
             slcan: Slcan::new(serial_number() as u16),
-            accepted: None,
+            accepted: [u16::MAX; IDENTIFIERS],
             lost: Lost::default(),
             heard: false,
         };
@@ -59,8 +62,9 @@ impl Port {
     pub fn recover_from_bus_off(&mut self) {}
 
     /// Sets the identifiers (data frames, 11 bits) that are received.
-    pub fn accept(&mut self, identifiers: [u16; 4]) {
-        self.accepted = Some(identifiers);
+    pub fn accept<const N: usize>(&mut self, identifiers: [u16; N]) {
+        const { assert!(N <= IDENTIFIERS, "virtual CAN: more identifiers than it has room for") };
+        self.accepted[..N].copy_from_slice(&identifiers);
     }
 
     /// The next frame for this device, `None` if there is none.
@@ -74,9 +78,7 @@ impl Port {
             }
             let frame = frame.inspect(|_| self.heard = true);
             let accepted = frame.filter(|frame| match frame.id() {
-                Id::Standard(id) if !frame.is_remote_frame() => {
-                    self.accepted.is_some_and(|accepted| accepted.contains(&id.as_raw()))
-                }
+                Id::Standard(id) if !frame.is_remote_frame() => self.accepted.contains(&id.as_raw()),
                 _ => false,
             });
             if accepted.is_some() {

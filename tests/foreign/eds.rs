@@ -19,7 +19,8 @@ const COMMITTED_BOARD: &str = "stm32f407g-disc1";
 fn dcfchk(eds: &Path) -> (bool, String) {
     // It is installed beside the interpreter, whose path may be a link and is not resolved.
     let dcfchk = given("COBOOT_PYTHON").with_file_name("dcfchk");
-    let output = Command::new(dcfchk).arg(eds).output().expect("dcfchk starts");
+    // It computes the COB-IDs of PDOs, which need a node-ID.
+    let output = Command::new(dcfchk).args(["-n", "1"]).arg(eds).output().expect("dcfchk starts");
     (output.status.success(), text(&output))
 }
 
@@ -121,6 +122,21 @@ fn python_canopen_finds_other_products_as_their_files_say() {
 #[test]
 fn python_canopen_finds_the_application_as_its_file_says() {
     compare(&eds::application(), board_with_application(), NODE);
+}
+
+/// python-canopen knows the PDOs by the file: it exchanges values and changes mapping and transmission type by its
+/// own procedure. The call back at its end leads into the bootloader.
+#[test]
+fn python_canopen_exchanges_pdos_with_the_application() {
+    let folder = kit::folder!("eds");
+    let image = eds::application();
+    let mut endpoint = Endpoint::new(board_with_application());
+    let mut client = script("pdo_client.py");
+    client.arg(endpoint.address()).arg(folder.write(&image.file, image.eds()));
+    println!("{}", endpoint.succeed(&mut client));
+    endpoint.bench.run_ms(100);
+    assert!(endpoint.bench.is_bootloader(NODE));
+    endpoint.bench.assert_nothing_unmodelled();
 }
 
 /// The other direction: the device has only objects that the file names. All objects and sub-indices that a client

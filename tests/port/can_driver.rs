@@ -81,7 +81,7 @@ impl CanDriver for Driver {
         self.registers.borrow_mut().recovers = true;
     }
 
-    fn accept(&mut self, identifiers: [u16; 4]) {
+    fn accept<const N: usize>(&mut self, identifiers: [u16; N]) {
         self.registers.borrow_mut().accepted = identifiers.to_vec();
     }
 

@@ -46,6 +46,8 @@ pub struct Image {
     pub description: String,
     /// Its object dictionary.
     pub entries: Vec<Entry>,
+    /// Those that PDOs may carry.
+    pub mappable: &'static [Entry],
     /// Its device information. The serial number is not used.
     pub device: Device,
     /// Whether node-ID and bit rate can be set over the bus.
@@ -118,6 +120,7 @@ fn bootloader(name: &str, product: &Product, sealed: bool) -> Image {
         file: file + ".eds",
         description,
         entries: entries::<MANY>(PROGRAMS, extras).parts().to_vec(),
+        mappable: &[],
         device: Device {
             device_type: product.profile.device_type,
             software_version: software_version.leak(),
@@ -138,6 +141,7 @@ pub fn application() -> Image {
         file: "coboot-application.eds".to_owned(),
         description: "The application template of coboot".to_owned(),
         entries: APPLICATION.to_vec(),
+        mappable: &application::PROCESS,
         device: Device { device_type: 0, software_version: "1.0.0", heartbeat_ms: 500, ..BOARD },
         lss: true,
         bit_rates: BIT_RATES.into_iter().filter(|kbit| can_run_at(kbit * 1000)).collect(),
@@ -224,12 +228,14 @@ impl Image {
         }
         eds.line("SimpleBootUpMaster", 0);
         eds.line("SimpleBootUpSlave", 1);
-        // There is no PDO, so no mapping with the granularity of bits or bytes.
-        eds.line("Granularity", 0);
+        // Whole bytes can be mapped; 0 is for a device without PDOs.
+        eds.line("Granularity", if self.mappable.is_empty() { 0 } else { 8 });
         eds.line("DynamicChannelsSupported", 0);
         eds.line("GroupMessaging", 0);
-        eds.line("NrOfRxPDO", 0);
-        eds.line("NrOfTxPDO", 0);
+        for (key, parameters) in [("NrOfRxPDO", 0x1400..0x1600), ("NrOfTxPDO", 0x1800..0x1A00)] {
+            let pdos = self.indices().into_iter().filter(|index| parameters.contains(index));
+            eds.line(key, pdos.count());
+        }
         eds.line("LSS_Supported", u8::from(self.lss));
         eds.line("CompactPDO", 0);
 
@@ -289,7 +295,8 @@ impl Image {
         if let Some(value) = self.default(entry) {
             eds.line("DefaultValue", value);
         }
-        eds.line("PDOMapping", 0);
+        let is_mappable = self.mappable.iter().any(|mappable| mappable.at == entry.at);
+        eds.line("PDOMapping", u8::from(is_mappable));
     }
 
     /// The value that a device returns before the first write: from the table, from the head

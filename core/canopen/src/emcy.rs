@@ -45,6 +45,12 @@ pub mod code {
     pub const CAN_PASSIVE: u16 = 0x8120;
     /// The CAN controller was off the bus and is back.
     pub const BUS_OFF_RECOVERED: u16 = 0x8140;
+    /// A PDO was not processed: it is too short.
+    pub const PDO_LENGTH: u16 = 0x8210;
+    /// A PDO is longer than what is mapped.
+    pub const PDO_LENGTH_EXCEEDED: u16 = 0x8220;
+    /// SYNC has data and should have none.
+    pub const SYNC_LENGTH: u16 = 0x8240;
     /// Defined by the manufacturer.
     pub const DEVICE_SPECIFIC: u16 = 0xFF00;
 }

@@ -20,6 +20,7 @@
 //! | [`line`](mod@line) | state of the CAN controller: error passive, bus-off, frames lost |
 //! | [`slave`] | a device on the bus: node, LSS and line together |
 //! | [`password`] | a password check that slows down guessing |
+//! | [`pdo`] | process data objects and SYNC, of an application |
 //! | [`program`] | program download: the indices and values of CiA 302-3 |
 #![no_std]
 #![forbid(unsafe_code)]
@@ -41,6 +42,7 @@ pub mod nmt;
 pub mod node;
 pub mod od;
 pub mod password;
+pub mod pdo;
 pub mod program;
 pub mod sdo;
 pub mod slave;

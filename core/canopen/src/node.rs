@@ -140,6 +140,9 @@ impl Node {
         if self.state != NmtState::Stopped {
             self.sdo.handle(frame, now, objects);
         }
+        if let Some(exchange) = objects.exchange() {
+            exchange.handle(frame);
+        }
         None
     }
 
@@ -158,6 +161,13 @@ impl Node {
         if self.state != NmtState::Stopped {
             if let Some(emergency) = objects.next_emergency() {
                 return Some(Frame::full(CobId::emcy(self.id), emergency));
+            }
+        }
+        // Without one, nothing is left of this in the program.
+        if let Some(exchange) = objects.exchange() {
+            let frame = if self.state == NmtState::Operational { exchange.poll(now) } else { None };
+            if frame.is_some() {
+                return frame;
             }
         }
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
@@ -185,5 +195,8 @@ impl Node {
             _ => return,
         };
         self.state = state;
+        if let Some(exchange) = objects.exchange() {
+            exchange.state_changed(state);
+        }
     }
 }

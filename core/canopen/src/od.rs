@@ -42,7 +42,9 @@
 use core::fmt;
 
 use crate::abort::AbortCode;
-use crate::frame::Channel;
+use crate::frame::{Channel, CobId, Frame};
+use crate::nmt::NmtState;
+use crate::time::Instant;
 
 /// Index and sub-index of a value: the multiplexer of an SDO.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -352,6 +354,26 @@ pub enum Reply {
     Withhold,
 }
 
+/// What a device exchanges beside SDO, emergencies and NMT: PDOs and SYNC ([`Pdos`](crate::pdo::Pdos)
+/// has them), and frames of its own.
+pub trait Exchange {
+    /// A command of the NMT master: the node has this state now.
+    fn state_changed(&mut self, state: NmtState);
+
+    /// Processes any received frame that is no NMT command, after the boot-up.
+    fn handle(&mut self, frame: &Frame);
+
+    /// The next frame to send, `None` if there is none. It is asked in OPERATIONAL alone, when no
+    /// answer and no emergency waits.
+    fn poll(&mut self, now: Instant) -> Option<Frame>;
+
+    /// The identifiers to accept in addition to those of the slave, counted from 0; `None` behind the last.
+    fn identifier(&self, place: usize) -> Option<CobId>;
+
+    /// Whether they were changed since the last call.
+    fn identifiers_changed(&mut self) -> bool;
+}
+
 /// The values of the table.
 ///
 /// Variables and strings are read and written as a whole. **Domains** are streamed, and the server
@@ -473,6 +495,11 @@ pub trait Objects {
     /// The data of the next emergency to send, `None` if there is none ([`Emcy`](crate::emcy::Emcy)
     /// stores them).
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
+        None
+    }
+
+    /// What the device exchanges beside SDO, emergencies and NMT, `None` if there is nothing.
+    fn exchange(&mut self) -> Option<&mut dyn Exchange> {
         None
     }
 

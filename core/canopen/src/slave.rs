@@ -59,7 +59,8 @@ pub enum Output {
     Listen(BitRate),
     /// Start the controller's recovery from bus-off.
     RecoverFromBusOff,
-    /// Accept exactly the frames with these identifiers; the list may contain one twice.
+    /// Accept exactly the frames with these identifiers, and with those of the device's
+    /// [`Exchange`](crate::od::Exchange); the list may contain one twice.
     Accept([CobId; 4]),
 }
 
@@ -180,6 +181,9 @@ impl Slave {
         if D::has_second_server() {
             let second = device.second_server().request;
             self.accept |= core::mem::replace(&mut self.second, second) != second;
+        }
+        if let Some(exchange) = device.exchange() {
+            self.accept |= exchange.identifiers_changed();
         }
         false
     }

@@ -36,7 +36,7 @@ use crate::bit_rate::BitRate;
 use crate::frame::{Channel, NodeId};
 use crate::line::LineEvent;
 use crate::lss::{LssDevice, StoreError};
-use crate::od::{put, Access, Address, DataType, Entry, Objects, Reply};
+use crate::od::{put, Access, Address, DataType, Entry, Exchange, Objects, Reply};
 use crate::program::ERROR_REGISTER;
 use crate::slave::SlaveDevice;
 
@@ -377,6 +377,10 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
         let [low, high] = USER_SOFTWARE.to_le_bytes();
         let [a, b, c, d] = address.to_le_bytes();
         Some([low, high, register[0], stop as u8, a, b, c, d])
+    }
+
+    fn exchange(&mut self) -> Option<&mut dyn Exchange> {
+        self.device.exchange()
     }
 
     fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {

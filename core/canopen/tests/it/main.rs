@@ -9,6 +9,7 @@ mod group;
 mod line;
 mod lss;
 mod node;
+mod pdo;
 mod properties;
 mod second_server;
 mod server;

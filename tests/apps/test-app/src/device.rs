@@ -8,7 +8,7 @@ use app_template::objects::Application;
 use bsp::LAYOUT;
 use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
-use canopen::od::{put, Access, Address, DataType, Entry, Objects, Reply};
+use canopen::od::{put, Access, Address, DataType, Entry, Exchange, Objects, Reply};
 use canopen::password::Lock;
 use canopen::program::{Numbers, UNLOCK, UNLOCK_ENTRIES};
 use canopen::slave::{Slave, SlaveDevice};
@@ -135,6 +135,10 @@ impl Objects for Device {
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         self.application.next_emergency()
+    }
+
+    fn exchange(&mut self) -> Option<&mut dyn Exchange> {
+        self.application.exchange()
     }
 }
 
