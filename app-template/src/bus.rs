@@ -5,13 +5,13 @@ use canopen::slave::{Output, Slave, SlaveDevice};
 use canopen::{CobId, Instant};
 use rtic::Mutex;
 
-use crate::entries::RECEIVE;
+use crate::entries::PDOS;
 use crate::process::OWN;
 
 /// The identifiers that the slave accepts.
 const OF_SLAVE: usize = 4;
-/// With SYNC, and those of the application.
-const IDENTIFIERS: usize = OF_SLAVE + 1 + RECEIVE.len() + OWN.len();
+/// With SYNC, those of the RPDOs (each PDO has room), and those of the application.
+const IDENTIFIERS: usize = OF_SLAVE + 1 + PDOS.len() + OWN.len();
 
 /// Carries out the slave's actions until there are none left.
 pub fn carry_out(

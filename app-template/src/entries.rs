@@ -4,7 +4,7 @@
 use canopen::device;
 use canopen::emcy;
 use canopen::od::{Access, DataType, Entry, Table};
-use canopen::pdo::{self, Preset, EVENT_DRIVEN};
+use canopen::pdo::{self, Preset};
 use canopen::program::{control_count, Numbers, APPLICATION_STATE_ENTRIES, DATE_ENTRIES};
 use coboot_app::layout::Layout;
 use coboot_app::renewal;
@@ -18,7 +18,7 @@ pub const STATE: u16 = 0x2202;
 /// How fast it moves, in 1/min.
 pub const ACTUAL_VALUE: u16 = 0x2203;
 
-/// The objects of the process: `process.rs` has their values, and PDOs may carry each of them.
+/// The objects of the process, from 2200h on: `process.rs` has their values, and PDOs may carry each of them.
 pub const PROCESS: [Entry; 4] = [
     Entry::var(COMMAND, "Command", DataType::Unsigned8, Access::Rw).default(0),
     Entry::var(SETPOINT, "Setpoint", DataType::Unsigned16, Access::Rw).default(0),
@@ -26,30 +26,13 @@ pub const PROCESS: [Entry; 4] = [
     Entry::var(ACTUAL_VALUE, "Actual value", DataType::Unsigned16, Access::Ro).default(0),
 ];
 
-/// The RPDOs, the first one on 200h + node-ID: add yours. A master may change them until the next reset.
-pub static RECEIVE: [Preset; 1] = [Preset {
-    transmission: EVENT_DRIVEN,
-    inhibit: 0,
-    event_ms: 0,
-    mapping: &[of_process(COMMAND), of_process(SETPOINT)],
-}];
-
-/// The TPDOs, the first one on 180h + node-ID: sent when a value has changed, after 10 ms at the earliest.
-pub static TRANSMIT: [Preset; 1] = [Preset {
-    transmission: EVENT_DRIVEN,
-    inhibit: 100,
-    event_ms: 0,
-    mapping: &[of_process(STATE), of_process(ACTUAL_VALUE)],
-}];
-
-/// The entry of this object.
-const fn of_process(index: u16) -> Entry {
-    let mut n = 0;
-    while PROCESS[n].at.index != index {
-        n += 1;
-    }
-    PROCESS[n]
-}
+/// The PDOs: an RPDO on 200h + node-ID, and a TPDO on 180h + node-ID, sent when a value has changed, 10 ms
+/// after the one before at the earliest.
+#[rustfmt::skip]
+pub static PDOS: [Preset; 2] = [
+    Preset { index: 0x1400, transmission: 254, inhibit: 0, event_ms: 0, mapping: &[PROCESS[0], PROCESS[1]] },
+    Preset { index: 0x1800, transmission: 254, inhibit: 100, event_ms: 0, mapping: &[PROCESS[2], PROCESS[3]] },
+];
 
 /// The sub-indices of program control on a device with this memory map: its programs, and the bootloader
 /// itself where the map has room for a new one (docs/renewal.md).
@@ -66,7 +49,7 @@ pub const fn entry_count(numbers: Numbers) -> usize {
         + control_count(numbers)
         + APPLICATION_STATE_ENTRIES.len()
         + DATE_ENTRIES.len()
-        + pdo::entry_count(&RECEIVE, &TRANSMIT)
+        + pdo::entry_count(&PDOS)
         + PROCESS.len()
 }
 
@@ -79,6 +62,6 @@ pub const fn entries<const LEN: usize>(numbers: Numbers) -> Table<LEN> {
         .with_program_control(numbers)
         .with(&APPLICATION_STATE_ENTRIES)
         .with(&DATE_ENTRIES)
-        .with_pdos(&RECEIVE, &TRANSMIT)
+        .with_pdos(&PDOS)
         .with(&PROCESS)
 }

@@ -23,7 +23,7 @@ use coboot_app::rules::Command;
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{Bootloader, Defaults, Next, ProgramControl, Start};
 
-use crate::entries::{entries, entry_count, numbers, RECEIVE, TRANSMIT};
+use crate::entries::{entries, entry_count, numbers, COMMAND, PDOS};
 use crate::process::{may_leave, Process, LEAVES, MACHINE, OWN};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h shows a host that the
@@ -58,7 +58,7 @@ pub struct Application {
     /// The time of the last call of [`Self::set_time`].
     now: Instant,
     emcy: Emcy,
-    pdos: Pdos<{ RECEIVE.len() }, { TRANSMIT.len() }>,
+    pdos: Pdos<{ PDOS.len() }>,
     process: Process,
     /// Node-ID in force.
     id: Option<NodeId>,
@@ -118,7 +118,7 @@ impl Application {
             now: Instant::from_millis(0),
             bit_rate: BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE),
             emcy: Emcy::new(),
-            pdos: Pdos::new(&RECEIVE, &TRANSMIT),
+            pdos: Pdos::new(&PDOS, None),
             process: Process,
             id: start.node_id.and_then(NodeId::new),
         }
@@ -168,7 +168,7 @@ impl Objects for Application {
         if let Some(read) = self.device.read(at, buf).or_else(|| self.pdos.read(at, buf)) {
             return read;
         }
-        if self.process.has(at) {
+        if at.index >= COMMAND {
             return self.process.read(at, buf);
         }
         match self.control.read(at.index, at.sub, &mut self.bootloader) {
@@ -181,7 +181,7 @@ impl Objects for Application {
         match (at.index, data) {
             (PROGRAM_CONTROL, &[START_BOOTLOADER]) => self.start_bootloader(at.sub, expedited),
             (PROGRAM_CONTROL, value) => self.command(at.sub, value, expedited),
-            _ if self.process.has(at) => self.process.write(at, data).map(|()| Reply::Send),
+            (COMMAND.., _) => self.process.write(at, data).map(|()| Reply::Send),
             _ => {
                 let written = self.emcy.write(at, data);
                 let written = written.or_else(|| self.pdos.write(at, data, &ENTRIES, &self.process));

@@ -4,7 +4,7 @@
 use core::sync::atomic::{AtomicU16, AtomicU8, Ordering::SeqCst};
 
 use canopen::nmt::NmtState;
-use canopen::od::{find, put, Address, Entry, Objects};
+use canopen::od::{put, Address, Entry, Objects};
 use canopen::{AbortCode, CobId, Frame};
 
 use crate::entries::{ACTUAL_VALUE, COMMAND, PROCESS, SETPOINT, STATE};
@@ -31,6 +31,11 @@ pub fn may_leave() -> bool {
     MACHINE.compare_exchange(STANDS, LEAVES, SeqCst, SeqCst).is_ok()
 }
 
+fn stop() {
+    // It may stand already, or leave.
+    let _ = MACHINE.compare_exchange(MOVES, STANDS, SeqCst, SeqCst);
+}
+
 /// COB-IDs of frames that the application takes itself, beside NMT, SDO, LSS, SYNC and its RPDOs: TIME
 /// (100h), for instance, or the heartbeat of another node. They arrive in [`Process::handle`].
 pub const OWN: [CobId; 0] = [];
@@ -39,16 +44,11 @@ pub const OWN: [CobId; 0] = [];
 pub struct Process;
 
 impl Process {
-    /// Whether it has this object.
-    pub fn has(&self, at: Address) -> bool {
-        find(&PROCESS, at).is_ok()
-    }
-
     /// The NMT state is this one now.
     pub fn state_changed(&mut self, state: NmtState) {
         if state != NmtState::Operational {
             // Nobody drives the machine any more.
-            let _ = MACHINE.compare_exchange(MOVES, STANDS, SeqCst, SeqCst);
+            stop();
         }
     }
 
@@ -78,12 +78,10 @@ impl Objects for Process {
 
     fn write(&mut self, at: Address, data: &[u8]) -> Result<(), AbortCode> {
         match (at.index, data) {
-            (COMMAND, &[value @ 0..=1]) => {
-                let (from, to) = if value == 1 { (STANDS, MOVES) } else { (MOVES, STANDS) };
-                match MACHINE.compare_exchange(from, to, SeqCst, SeqCst) {
-                    Err(LEAVES) if to == MOVES => return Err(AbortCode::DEVICE_STATE),
-                    // It does so already, or does so now.
-                    _ => {}
+            (COMMAND, &[0]) => stop(),
+            (COMMAND, &[1]) => {
+                if MACHINE.compare_exchange(STANDS, MOVES, SeqCst, SeqCst) == Err(LEAVES) {
+                    return Err(AbortCode::DEVICE_STATE);
                 }
             }
             (SETPOINT, &[low, high]) => SPEED.store(u16::from_le_bytes([low, high]), SeqCst),

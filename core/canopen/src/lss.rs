@@ -238,17 +238,6 @@ impl Lss {
         }
     }
 
-    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
-    /// never.
-    #[must_use]
-    pub const fn next_deadline(&self) -> Option<Instant> {
-        match self.activation {
-            Activation::None => None,
-            Activation::Before { switch_at, .. } => Some(switch_at),
-            Activation::After { until } => Some(until),
-        }
-    }
-
     /// Processes any received frame; frames other than LSS requests are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl LssDevice) {
         if !frame.has_cob_id(CobId::LSS_REQUEST) || self.is_silent(now) || self.storing {

@@ -1,8 +1,7 @@
 //! A slave: NMT, boot-up, heartbeat and SDO server of one node-ID.
 //!
 //! The owner passes every received frame to [`Node::handle`], then fetches frames with
-//! [`Node::poll`] until there are none. It calls `poll` again at least every few milliseconds (or
-//! at [`Node::next_deadline`]).
+//! [`Node::poll`] until there are none. It calls `poll` again at least every few milliseconds.
 
 use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
@@ -41,13 +40,6 @@ impl Default for Config {
         Self { boot_up: true, heartbeat_ms: 0, nmt: NmtPolicy::default(), sdo: SdoConfig::DEFAULT }
     }
 }
-
-/// A command of the NMT master to this node.
-///
-/// The node itself has carried out Start, Stop and `EnterPreOperational`. The owner carries out the
-/// two resets: it restarts the device, or calls [`Node::restart`] with the node-ID that is active
-/// now.
-pub type NmtEvent = NmtCommand;
 
 /// A slave on the bus.
 #[derive(Debug)]
@@ -108,27 +100,16 @@ impl Node {
         self.sdo.reset(objects);
     }
 
-    /// Starts again with this node-ID, as after Reset communication: a transfer ends, and the
-    /// boot-up message is sent again.
-    pub fn restart(&mut self, id: NodeId, objects: &mut impl Objects) {
-        self.sdo.reset(objects);
-        let config = Config {
-            boot_up: self.boot_up,
-            heartbeat_ms: self.heartbeat.period_ms(),
-            nmt: self.nmt,
-            sdo: self.sdo.config(),
-        };
-        *self = Self::new(id, config);
-    }
-
     /// Sets the value of 1017h: the heartbeat's period in milliseconds, 0 for none. The same value
     /// again changes nothing, so the owner may call this after every frame.
     pub fn set_heartbeat_ms(&mut self, period_ms: u16, now: Instant) {
         self.heartbeat.set_period(period_ms, now);
     }
 
-    /// Processes any received frame; returns the NMT command if the frame is one for this node.
-    pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtEvent> {
+    /// Processes any received frame; returns the NMT command if the frame is one for this node. The node
+    /// itself has carried out Start, Stop and `EnterPreOperational`; the owner carries out the two resets:
+    /// it restarts the device, or makes a node with the node-ID that is active now.
+    pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtCommand> {
         // A node accepts nothing before its boot-up message.
         if self.state == NmtState::Initialisation {
             return None;
@@ -171,16 +152,6 @@ impl Node {
             }
         }
         self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
-    }
-
-    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
-    /// never.
-    #[must_use]
-    pub fn next_deadline(&self) -> Option<Instant> {
-        match (self.sdo.next_deadline(), self.heartbeat.deadline()) {
-            (Some(sdo), Some(heartbeat)) => Some(sdo.earlier(heartbeat)),
-            (sdo, heartbeat) => sdo.or(heartbeat),
-        }
     }
 
     fn command(&mut self, command: NmtCommand, objects: &mut impl Objects) {

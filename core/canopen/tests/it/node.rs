@@ -46,7 +46,6 @@ fn says_its_boot_up_once_and_then_its_heartbeat() {
     assert_eq!(bench.handle(&request(READ_1000), 0), None);
     assert_eq!(bench.sent(50), [state(0x00)]);
     assert_eq!(bench.node.state(), NmtState::PreOperational);
-    assert_eq!(bench.node.next_deadline(), Some(at(150)));
     assert_eq!(bench.sent(149), []);
     assert_eq!(bench.sent(150), [state(0x7F)]);
     assert_eq!(bench.sent(150), []);
@@ -55,7 +54,6 @@ fn says_its_boot_up_once_and_then_its_heartbeat() {
     bench.node.set_heartbeat_ms(10, at(170));
     assert_eq!(bench.sent(180), [state(0x7F)]);
     bench.node.set_heartbeat_ms(0, at(180));
-    assert_eq!(bench.node.next_deadline(), None);
     assert_eq!(bench.sent(10_000), []);
 }
 
@@ -97,38 +95,6 @@ fn an_application_follows_its_master() {
     bench.handle(&nmt(&[0x80, 5]), 201);
     bench.handle(&request(READ_1000), 202);
     assert_eq!(bench.sent(300), [response(IS_1000), state(0x7F)]);
-}
-
-#[test]
-fn reset_communication_takes_a_new_node_id() {
-    let mut bench = Bench::new(Config { heartbeat_ms: 100, ..Config::default() });
-    assert_eq!(bench.sent(0), [state(0x00)]);
-    bench.handle(&request([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0]), 1);
-    assert_eq!(bench.handle(&nmt(&[0x82, 5]), 2), Some(NmtCommand::ResetCommunication));
-    let id = NodeId::new(6).unwrap();
-    bench.node.restart(id, &mut bench.device);
-    assert_eq!(bench.device.events, [Event::Start(Some(9)), Event::Cancel]);
-    // The waiting answer was dropped with the old node-ID.
-    assert_eq!(bench.sent(50), [Frame::of(CobId::new(0x706).unwrap(), &[0x00])]);
-    assert_eq!(bench.sent(150), [Frame::of(CobId::new(0x706).unwrap(), &[0x7F])]);
-    bench.handle(&request(READ_1000), 160);
-    assert_eq!(bench.sent(160), []);
-    bench.handle(&Frame::of(CobId::new(0x606).unwrap(), &READ_1000), 160);
-    assert_eq!(bench.sent(160), [Frame::of(CobId::new(0x586).unwrap(), &IS_1000)]);
-}
-
-/// The configuration of the SDO server, here its block size, is that of the owner.
-#[test]
-fn a_restart_keeps_the_configuration() {
-    let sdo = canopen::sdo::server::Config { blksize: 4, ..Default::default() };
-    let mut bench = Bench::new(Config { sdo, ..Config::default() });
-    bench.sent(0);
-    for _ in 0..2 {
-        bench.handle(&request([0xC2, 0x50, 0x1F, 1, 9, 0, 0, 0]), 1);
-        assert_eq!(bench.sent(1), [response([0xA0 | 4, 0x50, 0x1F, 1, 4, 0, 0, 0])]);
-        bench.node.restart(node(), &mut bench.device);
-        assert_eq!(bench.sent(1), [state(0x00)]);
-    }
 }
 
 #[test]

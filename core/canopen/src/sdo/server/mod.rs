@@ -207,12 +207,6 @@ impl SdoServer {
         }
     }
 
-    /// The configuration.
-    #[must_use]
-    pub const fn config(&self) -> Config {
-        self.config
-    }
-
     /// Whether no transfer runs and no answer waits to be fetched.
     #[must_use]
     pub const fn is_idle(&self) -> bool {
