@@ -224,6 +224,7 @@ impl SlaveDevice for Application {
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
         self.pdos.reset(id);
+        self.process.state_changed(NmtState::Initialisation);
         self.control.node_id_changed(id.map(NodeId::get));
     }
 }

@@ -413,12 +413,13 @@ impl<const N: usize> Pdos<N> {
         process: &impl Objects,
     ) -> Option<Result<(), AbortCode>> {
         let mut value = data.iter().rfold(0, |value, byte| value << 8 | u32::from(*byte));
-        self.identifiers_changed = true;
         if at == SYNC {
             // Bit 31 has no meaning; bit 30 would make the device the producer.
             let id = u16::try_from(value & !INVALID).ok().and_then(CobId::new);
             let id = id.filter(|id| !is_restricted(id.get().into()));
-            return Some(id.map(|id| self.sync = id).ok_or(AbortCode::INVALID_VALUE));
+            let Some(id) = id else { return Some(Err(AbortCode::INVALID_VALUE)) };
+            self.identifiers_changed |= mem::replace(&mut self.sync, id) != id;
+            return Some(Ok(()));
         }
         let pdo = self.find(at)?;
         // The present value again changes nothing.
@@ -428,7 +429,8 @@ impl<const N: usize> Pdos<N> {
         if let Err(code) = pdo.check(at, value, dictionary, process) {
             return Some(Err(code));
         }
-        if (at.index, at.sub) == (pdo.index, 1) {
+        let is_cob_id = (at.index, at.sub) == (pdo.index, 1);
+        if is_cob_id {
             // It says that there are no remote frames, whatever a master writes.
             value = value & !NO_RTR | if pdo.is_transmit() { NO_RTR } else { 0 };
         }
@@ -436,6 +438,7 @@ impl<const N: usize> Pdos<N> {
         if (at.index, at.sub) != (pdo.index, 5) {
             pdo.progress = Progress::default();
         }
+        self.identifiers_changed |= is_cob_id;
         Some(Ok(()))
     }
 
