@@ -217,7 +217,8 @@ enum Work {
     Fetching {
         task: Task,
         at: Duration,
-        /// The most bytes of the file that were there: an attempt that begins anew has made no progress before.
+        /// The most bytes of the file that were there: an attempt that begins anew has made no
+        /// progress before.
         highest: u64,
         /// The attempts since then.
         failures: u32,

@@ -45,8 +45,8 @@ pub(super) struct Opened {
 }
 
 impl Client {
-    /// A connection through this proxy, or without one: those of the environment are for what the user of the
-    /// computer looks at, and would see the token.
+    /// A connection through this proxy, or without one: those of the environment are for what the
+    /// user of the computer looks at, and would see the token.
     ///
     /// # Errors
     /// In words, for a proxy or a file with certificates that cannot be used.

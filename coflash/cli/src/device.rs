@@ -121,12 +121,13 @@ impl Patience {
 /// Whether the user is asked something: nothing is under way that could be ended in order.
 static ASKED: AtomicBool = AtomicBool::new(false);
 
-/// Signals within this time are one: a terminal that is closed sends SIGHUP twice, by the system and by its shell.
+/// Signals within this time are one: a terminal that is closed sends SIGHUP twice, by the system
+/// and by its shell.
 const ONE_SIGNAL: Duration = Duration::from_secs(1);
 
-/// The flag that Ctrl-C sets, and likewise SIGTERM (the stop of a service) and SIGHUP (a terminal that is closed); on
-/// Windows Ctrl-Break, while a console that is closed waits for nobody. The first signal ends a transfer in an orderly
-/// way, a later one ends the program at once.
+/// The flag that Ctrl-C sets, and likewise SIGTERM (the stop of a service) and SIGHUP (a terminal
+/// that is closed); on Windows Ctrl-Break, while a console that is closed waits for nobody. The
+/// first signal ends a transfer in an orderly way, a later one ends the program at once.
 pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
     if let Some(flag) = FLAG.get() {

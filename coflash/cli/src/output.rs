@@ -279,7 +279,8 @@ pub(super) struct Failure {
     advice: Option<String>,
     /// The device's own answers, in words.
     answers: Vec<String>,
-    /// What is wrong with the line, if `what` quotes words of it: one may be a secret, so records have this alone.
+    /// What is wrong with the line, if `what` quotes words of it: one may be a secret, so records
+    /// have this alone.
     quoted: Option<ErrorKind>,
     /// Whether the document on standard output already contains the failure.
     is_shown: bool,

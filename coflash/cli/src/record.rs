@@ -192,7 +192,8 @@ pub(super) fn failed(update: &coflash_core::update::FailedUpdate, more: &[(&str,
     let _ = report.write(&[]);
 }
 
-/// Records what is begun, before the first frame: it is known of a run that is killed, or loses its power.
+/// Records what is begun, before the first frame: it is known of a run that is killed, or loses its
+/// power.
 pub(super) fn begun(devices: &Value) -> Result<(), String> {
     let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) else { return Ok(()) };
     report.write(&[("begun", devices.clone())])
@@ -203,8 +204,8 @@ pub(super) fn document(path: &Path) -> Option<Value> {
     serde_json::from_str(&read_text(path).ok()?).ok()
 }
 
-/// When the update of a device's program was begun that did not end: of the runs in the folder of the reports and
-/// of `earlier`, the document of one more, the latest counts.
+/// When the update of a device's program was begun that did not end: of the runs in the folder of
+/// the reports and of `earlier`, the document of one more, the latest counts.
 pub(super) fn unended(device: &Value, earlier: Option<&Value>) -> Option<String> {
     let all = folder().and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
     let mut runs: Vec<_> = all.filter_map(|run| Some(run.ok()?.path().join(FILES[0]))).collect();

@@ -6,14 +6,15 @@ use coboot_can::redact::is_password;
 
 use super::values::address;
 
-/// The options with a secret value. A command that switches the power may have the password of a relay.
+/// The options with a secret value. A command that switches the power may have the password of a
+/// relay.
 const SECRET: [&str; 4] = ["--unlock", "--key", "--of-value", "--power-command"];
 
 /// The replacement for a password.
 pub(super) const HIDDEN: &str = "***";
 
-/// The words with the secrets hidden: the values of the options with one, and the passwords that the command
-/// writes into an object, if it writes one.
+/// The words with the secrets hidden: the values of the options with one, and the passwords that
+/// the command writes into an object, if it writes one.
 pub(super) fn without(words: &[OsString], passwords: &[&str]) -> Vec<String> {
     let mut hide = false;
     let shown = |word: &OsString| {
@@ -30,8 +31,8 @@ pub(super) fn without(words: &[OsString], passwords: &[&str]) -> Vec<String> {
     words.iter().map(shown).collect()
 }
 
-/// Whether a line of the shell has a secret: it is not kept for the next start. What an object with a name is, only
-/// its sheet says.
+/// Whether a line of the shell has a secret: it is not kept for the next start. What an object with
+/// a name is, only its sheet says.
 pub(super) fn are_in(line: &[String]) -> bool {
     let words: Vec<OsString> = line.iter().map(OsString::from).collect();
     let mut objects = line.iter().filter(|word| word.len() >= 4).filter_map(|word| address(word)).peekable();

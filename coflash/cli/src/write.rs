@@ -50,8 +50,8 @@ pub(super) struct Write {
 }
 
 impl Write {
-    /// The words that may be a password. What an object with a name is, only the sheet says, and both words may
-    /// have been exchanged.
+    /// The words that may be a password. What an object with a name is, only the sheet says, and
+    /// both words may have been exchanged.
     pub(super) fn passwords(&self) -> Vec<&str> {
         match address(&self.object) {
             Some(at) if !is_password(at) => Vec::new(),

@@ -107,7 +107,8 @@ fn a_server_with_another_certificate_gets_no_request() {
     }
 }
 
-/// RFC 5280 section 4.2.1.9, as the library reads it: the certificate of an authority is not one of a server.
+/// RFC 5280 section 4.2.1.9, as the library reads it: the certificate of an authority is not one of
+/// a server.
 #[test]
 fn a_server_that_is_its_own_authority_gets_advice_and_no_request() {
     let server = Server::start(&["door"]);

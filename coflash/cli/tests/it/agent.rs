@@ -8,7 +8,8 @@ use crate::tool::folder;
 /// The controller-ID of the device.
 const ID: &str = "door";
 
-/// The variables for proxies. Nobody listens there: whoever asks a proxy of the environment reaches no server.
+/// The variables for proxies. Nobody listens there: whoever asks a proxy of the environment reaches
+/// no server.
 const PROXIES: [&str; 3] = ["http_proxy", "https_proxy", "ALL_PROXY"];
 
 /// The command, as people run it: exit code, standard output and standard error.
@@ -60,7 +61,8 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     wrong(&[&bus[..], &["--hawkbit", "http://hawkbit.example.com"]].concat(), "plain text");
     wrong(&[&bus[..], &["--hawkbit", &server.url, "--trace", "x.log"]].concat(), "--trace");
 
-    // The proxy of its own file: it hears of the server alone, and a server on this computer needs none.
+    // The proxy of its own file: it hears of the server alone, and a server on this computer needs
+    // none.
     let proxy = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let text = format!("proxy = 'http://{}'\nplain-http = true\n{door}", proxy.local_addr().unwrap());
     std::fs::write(folder.join("agent.toml"), text).unwrap();

@@ -303,8 +303,9 @@ fn what_contradicts_a_package_is_refused() {
     run(command().env("XDG_STATE_HOME", &root).args(words)).fails(1, &told);
 }
 
-/// A run that was killed has left what it had begun, in its report or in the folder of the reports: the next run does
-/// not say that the device had its program. One of another device does, and one after a later run that has ended.
+/// A run that was killed has left what it had begun, in its report or in the folder of the reports:
+/// the next run does not say that the device had its program. One of another device does, and one
+/// after a later run that has ended.
 #[test]
 fn a_device_that_an_interrupted_run_has_written_did_not_have_its_program() {
     let folder = folder("package-resumed");

@@ -171,8 +171,8 @@ fn a_password_that_write_sends_is_in_no_record() {
     }
 }
 
-/// What the parser does not understand may be a key after a misspelled option, or the value of the right one. Its words
-/// are on the terminal alone.
+/// What the parser does not understand may be a key after a misspelled option, or the value of the
+/// right one. Its words are on the terminal alone.
 #[test]
 fn an_error_of_a_line_of_the_shell_has_no_secret_in_the_records() {
     let folder = folder("shell-secrets");
@@ -199,7 +199,8 @@ fn an_error_of_a_line_of_the_shell_has_no_secret_in_the_records() {
     }
 }
 
-/// A shell that waits for a line, and a service station in the middle of an update, when their service is stopped.
+/// A shell that waits for a line, and a service station in the middle of an update, when their
+/// service is stopped.
 #[cfg(unix)]
 #[test]
 fn what_is_stopped_leaves_its_reports() {

@@ -301,8 +301,9 @@ impl coboot_can::Adapter for Chatter {
     }
 }
 
-/// Ctrl-C, the stop of a service, and a terminal that is closed, in the middle of the blocks: the last one comes
-/// twice, by the system and by the shell. What is begun is in the reports before that.
+/// Ctrl-C, the stop of a service, and a terminal that is closed, in the middle of the blocks: the
+/// last one comes twice, by the system and by the shell. What is begun is in the reports before
+/// that.
 #[cfg(unix)]
 #[test]
 fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {

@@ -87,7 +87,8 @@ impl Admission<'_> {
         }
     }
 
-    /// [Judges](Self::judge), and asks all that is open of what runs now, a bootloader or an application. If an application leaves an answer out, its bootloader is asked all that it
+    /// [Judges](Self::judge), and asks all that is open of what runs now, a bootloader or an
+    /// application. If an application leaves an answer out, its bootloader is asked all that it
     /// knows better.
     ///
     /// # Errors

@@ -51,7 +51,8 @@ impl Folder {
         (0..files).map(file).collect()
     }
 
-    /// The table with this ending whose name has this part, the latest one: its name, and what is in it.
+    /// The table with this ending whose name has this part, the latest one: its name, and what is
+    /// in it.
     pub(super) fn latest(&self, part: &str, ending: &str) -> Option<(String, String)> {
         let names =
             fs::read_dir(&self.0).ok()?.filter_map(|entry| entry.ok()?.file_name().into_string().ok());

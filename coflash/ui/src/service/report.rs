@@ -79,10 +79,12 @@ fn of_device(row: &Row) -> String {
     node + &serial
 }
 
-/// Notes which devices have their program from an update that did not end: its report is the latest one.
+/// Notes which devices have their program from an update that did not end: its report is the latest
+/// one.
 pub(super) fn note_interrupted(rows: &mut [Row], folder: &Folder) {
     for row in rows {
-        let latest = folder.latest(&of_device(row), Report::ENDINGS[1]);
+        // Without its serial number it may be any device.
+        let latest = row.identity[3].and_then(|_| folder.latest(&of_device(row), Report::ENDINGS[1]));
         let is_in = |text: &str, step: &Step| text.contains(&step.program) && text.contains(&step.to);
         let is_of = |text: &str| row.steps.iter().all(|step| is_in(text, step));
         let begun = latest.filter(|(name, text)| name.contains(BEGUN) && is_of(text));
@@ -95,7 +97,8 @@ impl Report {
         Self { row, of, is_begun: false }
     }
 
-    /// The report of an update before its first frame: what is left of one whose computer loses its power.
+    /// The report of an update before its first frame: what is left of one whose computer loses its
+    /// power.
     pub(super) fn begun(row: Row, of: Arc<Of>) -> Self {
         Self { row, of, is_begun: true }
     }

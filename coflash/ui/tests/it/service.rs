@@ -415,7 +415,8 @@ fn the_end_of_the_server_saves_the_outcome() {
     let reports = saved(&folder, "csv");
     assert!(reports.len() == 1 && reports[0].1.contains(",failed,5,"), "{reports:?}");
 
-    // As after a loss of power in the update of node 5, which had its program by then; node 6 is as before.
+    // As after a loss of power in the update of node 5, which had its program by then; node 6 is as
+    // before.
     fs::remove_file(folder.join("reports").join(&reports[0].0)).unwrap();
     fs::write(folder.join("reports").join(name), begun).unwrap();
     let package = package(&folder, DRIVES);

@@ -58,8 +58,8 @@ impl Error {
 }
 
 impl Error {
-    /// Whether an application that runs as it should refuses the call to the bootloader in its present state:
-    /// its machine moves, or is in use.
+    /// Whether an application that runs as it should refuses the call to the bootloader in its
+    /// present state: its machine moves, or is in use.
     #[must_use]
     pub fn refuses_now(&self) -> bool {
         match *self {

@@ -285,7 +285,8 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
     }
 }
 
-/// Where the dialect is named, no frame is sent; where the bootloader alone says it, the application runs again.
+/// Where the dialect is named, no frame is sent; where the bootloader alone says it, the
+/// application runs again.
 #[test]
 fn a_password_of_another_form_stops_no_application() {
     for (running, dialect) in [
