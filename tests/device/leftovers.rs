@@ -13,6 +13,7 @@ use emulator::bus::{Outcome, Record};
 use emulator::machine::{self, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
+use shared_abi::geometry::Region;
 
 /// A program that stores the values of a table, ends in a state by the bits of the last one, and jumps.
 const SCRIPT: [u16; 40] = [
@@ -244,6 +245,83 @@ fn an_open_device_leaves_a_probe_its_breakpoints() {
         bench.await_boot_up(100);
         let found = [FP_CTRL, FP_COMP0].map(|register| bench.machine().register(register).unwrap());
         assert_eq!(found, if stays { [0x261, 0xC802_0001] } else { [0x260, 0] }, "{image}");
+    }
+}
+
+/// Writes the kept RAM (`Layout::kept`) as an application does before a reset.
+fn fill_kept(bench: &mut Bench) -> Vec<u8> {
+    let kept = firmware::board().kept();
+    let written: Vec<u8> = (0..kept.size).map(|n| (n * 7 + 5) as u8).collect();
+    bench.machine().write_ram(kept.base, &written).unwrap();
+    written
+}
+
+/// Runs up to the first instruction in this region, for two seconds at most.
+fn run_into(bench: &mut Bench, region: Region, what: &str) {
+    let end = bench.time() + Span::from_millis(2_000);
+    while !region.contains(bench.machine().pc(), 2) {
+        let next = bench.time() + Span::from_nanos(100);
+        assert!(next < end, "{what}: the core is at {:08X}h", bench.machine().pc());
+        bench.world.run_until(next);
+    }
+}
+
+/// A crash log or a dump of a panic is there after each reset but that of the power, and after the
+/// bootloader has run and written a program (docs/application.md). The program uses it as its stack
+/// here, so it is compared before its first instruction.
+#[test]
+fn the_end_of_the_ram_outlives_the_bootloader() {
+    let board = firmware::board();
+    let (kept, program) = (board.kept(), board.programs[0]);
+    assert_eq!(kept.size, 1024);
+    for image in iter::once(firmware::BOOTLOADER).chain(sealed()) {
+        let mut bench = Bench::of_image(image).switched_on();
+        // Reset of the boot stage takes some microseconds there.
+        let stage = Region::new(bench.word(board.bootloader.base + 4) & !1, 0x60);
+        let written = fill_kept(&mut bench);
+        let lost = |bench: &Bench| {
+            let found = bench.memory(kept.base, written.len());
+            (0..found.len()).find(|at| found[*at] != written[*at])
+        };
+        let blocks = firmware::blocks(firmware::APP_V1);
+        let options = FlashOptions::default().trial_run(false).start(false);
+        flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
+        bench.session().command(1, ProgramControl::SetSignature).unwrap();
+        assert_eq!(lost(&bench), None, "{image}: after an update");
+        // No session: the bootloader may answer after the reset.
+        let command = |bench: &mut Bench, command: u8| {
+            bench.post(REQUEST, &[0x2F, 0x51, 0x1F, 1, command, 0, 0, 0]);
+        };
+        for way in ["START", "NRST", "NMT reset node", "window watchdog"] {
+            match way {
+                "START" => command(&mut bench, 1),
+                "NRST" => bench.machine().reset_pin(),
+                "NMT reset node" => bench.post(0, &[0x81, NODE]),
+                // A counter below 40h (RM0090 section 22.3).
+                _ => poke(&mut bench, &[(APB1ENR, APB1_CLOCKS), (0x4000_2C00, 0x80)]),
+            }
+            run_into(&mut bench, stage, way);
+            fill_kept(&mut bench);
+            run_into(&mut bench, program, way);
+            assert_eq!(lost(&bench), None, "{image}: after {way}");
+            bench.await_program(1_000);
+            if way == "START" {
+                bench.confirm_program();
+            }
+        }
+        for (way, value) in [("call back", 0x80), ("STOP", 0)] {
+            command(&mut bench, value);
+            run_into(&mut bench, stage, way);
+            fill_kept(&mut bench);
+            bench.run_ms(100);
+            assert_eq!((bench.is_bootloader(NODE), lost(&bench)), (true, None), "{image}: after {way}");
+            bench.start_program();
+        }
+        fill_kept(&mut bench);
+        bench.power_off();
+        bench.power_on();
+        run_into(&mut bench, program, "the power");
+        assert!(lost(&bench).is_some(), "{image}: the power");
     }
 }
 
