@@ -367,7 +367,7 @@ pub trait Exchange {
     /// answer and no emergency waits.
     fn poll(&mut self, now: Instant) -> Option<Frame>;
 
-    /// The identifiers to accept in addition to those of the slave, counted from 0; `None` behind the last.
+    /// The identifiers to accept in addition to those of the slave, counted from 0; `None` after the last.
     fn identifier(&self, place: usize) -> Option<CobId>;
 
     /// Whether they were changed since the last call.
