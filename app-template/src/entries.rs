@@ -18,7 +18,8 @@ pub const STATE: u16 = 0x2202;
 /// How fast it moves, in 1/min.
 pub const ACTUAL_VALUE: u16 = 0x2203;
 
-/// The objects of the process, from 2200h on: `process.rs` has their values, and PDOs may carry each of them.
+/// The objects of the process, from 2200h on: `process.rs` has their values, and PDOs may carry
+/// each of them.
 pub const PROCESS: [Entry; 4] = [
     Entry::var(COMMAND, "Command", DataType::Unsigned8, Access::Rw).default(0),
     Entry::var(SETPOINT, "Setpoint", DataType::Unsigned16, Access::Rw).default(0),
@@ -26,8 +27,8 @@ pub const PROCESS: [Entry; 4] = [
     Entry::var(ACTUAL_VALUE, "Actual value", DataType::Unsigned16, Access::Ro).default(0),
 ];
 
-/// The PDOs: an RPDO on 200h + node-ID, and a TPDO on 180h + node-ID, sent when a value has changed, 10 ms
-/// after the one before at the earliest.
+/// The PDOs: an RPDO on 200h + node-ID, and a TPDO on 180h + node-ID, sent when a value has
+/// changed, 10 ms after the one before at the earliest.
 #[rustfmt::skip]
 pub static PDOS: [Preset; 2] = [
     Preset { index: 0x1400, transmission: 254, inhibit: 0, event_ms: 0, mapping: &[PROCESS[0], PROCESS[1]] },

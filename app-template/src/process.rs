@@ -36,8 +36,8 @@ fn stop() {
     let _ = MACHINE.compare_exchange(MOVES, STANDS, SeqCst, SeqCst);
 }
 
-/// COB-IDs of frames that the application takes itself, beside NMT, SDO, LSS, SYNC and its RPDOs: TIME
-/// (100h), for instance, or the heartbeat of another node. They arrive in [`Process::handle`].
+/// COB-IDs of frames that the application takes itself, beside NMT, SDO, LSS, SYNC and its RPDOs:
+/// TIME (100h), for instance, or the heartbeat of another node. They arrive in [`Process::handle`].
 pub const OWN: [CobId; 0] = [];
 
 /// The values are in statics, which other tasks read and write.

@@ -155,8 +155,8 @@ impl<I: Controller> Port<I> {
         let from_border = u32::MAX << border;
         let (first, share) = if I::IS_SLAVE { (border, from_border) } else { (0, !from_border) };
         change(FA1R, share, 0);
-        // A list of four identifiers of 16 bits in each bank; one of them may appear twice. STID is at
-        // 15:5, and RTR and IDE are clear.
+        // A list of four identifiers of 16 bits in each bank; one of them may appear twice. STID is
+        // at 15:5, and RTR and IDE are clear.
         let banks = ((1 << N.div_ceil(4)) - 1) << first;
         change(FM1R, 0, banks);
         change(FS1R, banks, 0);

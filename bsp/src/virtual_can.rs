@@ -20,8 +20,8 @@ static RECEIVED: Inbox<256> = Inbox::new();
 static TO_SEND: Ring<512> = Ring::new();
 /// The room that answers leave for frames: a host with endless commands cannot silence the device.
 const FOR_FRAMES: usize = 4 * FRAME_TEXT;
-/// The most identifiers that are received, as many as in four filter banks of bxCAN. A program always
-/// sets the same number of them; no frame has the others.
+/// The most identifiers that are received, as many as in four filter banks of bxCAN. A program
+/// always sets the same number of them; no frame has the others.
 const IDENTIFIERS: usize = 16;
 
 /// The UART, and the adapter on it.

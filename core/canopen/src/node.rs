@@ -106,9 +106,9 @@ impl Node {
         self.heartbeat.set_period(period_ms, now);
     }
 
-    /// Processes any received frame; returns the NMT command if the frame is one for this node. The node
-    /// itself has carried out Start, Stop and `EnterPreOperational`; the owner carries out the two resets:
-    /// it restarts the device, or makes a node with the node-ID that is active now.
+    /// Processes any received frame; returns the NMT command if the frame is one for this node. The
+    /// node itself has carried out Start, Stop and `EnterPreOperational`; the owner carries out the
+    /// two resets: it restarts the device, or makes a node with the node-ID that is active now.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) -> Option<NmtCommand> {
         // A node accepts nothing before its boot-up message.
         if self.state == NmtState::Initialisation {

@@ -354,8 +354,8 @@ pub enum Reply {
     Withhold,
 }
 
-/// What a device exchanges beside SDO, emergencies and NMT: PDOs and SYNC ([`Pdos`](crate::pdo::Pdos)
-/// has them), and frames of its own.
+/// What a device exchanges beside SDO, emergencies and NMT: PDOs and SYNC
+/// ([`Pdos`](crate::pdo::Pdos) has them), and frames of its own.
 pub trait Exchange {
     /// A command of the NMT master: the node has this state now.
     fn state_changed(&mut self, state: NmtState);
@@ -367,7 +367,8 @@ pub trait Exchange {
     /// answer and no emergency waits.
     fn poll(&mut self, now: Instant) -> Option<Frame>;
 
-    /// The identifiers to accept in addition to those of the slave, counted from 0; `None` after the last.
+    /// The identifiers to accept in addition to those of the slave, counted from 0; `None` after
+    /// the last.
     fn identifier(&self, place: usize) -> Option<CobId>;
 
     /// Whether they were changed since the last call.

@@ -1,11 +1,11 @@
 //! Process data objects and SYNC of a device (CiA 301 sections 7.2.2 and 7.2.5).
 //!
 //! A device keeps [`Pdos`] beside its other values, and calls them from its [`Objects`] and its
-//! [`Exchange`](crate::od::Exchange). Its process is an [`Objects`] of its own: what this one's table
-//! has may be mapped, into a TPDO if it can be read, into an RPDO if it can be written.
+//! [`Exchange`](crate::od::Exchange). Its process is an [`Objects`] of its own: what this one's
+//! table has may be mapped, into a TPDO if it can be read, into an RPDO if it can be written.
 //!
-//! The event of the transmission types 0, 254 and 255 is that a mapped value is another one. Not here:
-//! remote frames (types 252, 253), 29 bits, dummy entries, a counter or window of SYNC.
+//! The event of the transmission types 0, 254 and 255 is that a mapped value is another one. Not
+//! here: remote frames (types 252, 253), 29 bits, dummy entries, a counter or window of SYNC.
 
 use core::{array, mem};
 
@@ -277,8 +277,8 @@ impl Pdo {
         }
     }
 
-    /// Whether a parameter may have this value now, and the abort code if not. What exists keeps its
-    /// COB-ID, inhibit time and mapping; what is counted in the mapping keeps its objects.
+    /// Whether a parameter may have this value now, and the abort code if not. What exists keeps
+    /// its COB-ID, inhibit time and mapping; what is counted in the mapping keeps its objects.
     fn check(
         &self,
         at: Address,
@@ -365,8 +365,8 @@ impl<const N: usize> Pdos<N> {
         }
     }
 
-    /// Processes any received frame. Returns the code of an emergency: an RPDO is too short and has no
-    /// effect (8210h), an RPDO (8220h) or SYNC (8240h) is too long.
+    /// Processes any received frame. Returns the code of an emergency: an RPDO is too short and has
+    /// no effect (8210h), an RPDO (8220h) or SYNC (8240h) is too long.
     pub fn handle(&mut self, frame: &Frame, process: &mut impl Objects) -> Option<u16> {
         let id = frame.cob_id().filter(|_| self.is_operational)?;
         if id == self.sync {
@@ -397,14 +397,15 @@ impl<const N: usize> Pdos<N> {
         Some(put(buf, &value.to_le_bytes()[..len]))
     }
 
-    /// Writes a parameter; `None` for every other address. `dictionary` has all objects of the device.
+    /// Writes a parameter; `None` for every other address. `dictionary` has all objects of the
+    /// device.
     ///
     /// # Errors
-    /// [`AbortCode::INVALID_VALUE`] for a value that the parameter cannot have, or not while the PDO
-    /// exists. Of a mapping: what [`find`] says of the object, [`AbortCode::NOT_MAPPABLE`],
+    /// [`AbortCode::INVALID_VALUE`] for a value that the parameter cannot have, or not while the
+    /// PDO exists. Of a mapping: what [`find`] says of the object, [`AbortCode::NOT_MAPPABLE`],
     /// [`AbortCode::PDO_LENGTH`] for more than eight objects or bytes, [`AbortCode::PARAMETER`] in
-    /// another order than that of CiA 301 clause 7.5.2.36: the PDO is made invalid, the number set to 0,
-    /// the objects, the number, the PDO made valid.
+    /// another order than that of CiA 301 clause 7.5.2.36: the PDO is made invalid, the number set
+    /// to 0, the objects, the number, the PDO made valid.
     pub fn write(
         &mut self,
         at: Address,

@@ -1,5 +1,5 @@
-//! PDOs and SYNC: CiA 301 sections 7.2.2 and 7.2.5, codes of its tables 22 and 26. Where it leaves a
-//! choice, a comment says which other stack has made the same one.
+//! PDOs and SYNC: CiA 301 sections 7.2.2 and 7.2.5, codes of its tables 22 and 26. Where it leaves
+//! a choice, a comment says which other stack has made the same one.
 
 use std::collections::BTreeMap;
 
@@ -90,8 +90,8 @@ fn tpdo(input: u8) -> Option<Frame> {
     Some(Frame::of(CobId::new(0x185).unwrap(), &[input, 0, 0]))
 }
 
-/// An error of length is reported once, until a frame has another one, as by CANopenNode. The controller
-/// gives eight bytes for the codes 9 to 15.
+/// An error of length is reported once, until a frame has another one, as by CANopenNode. The
+/// controller gives eight bytes for the codes 9 to 15.
 #[test]
 fn frames_of_every_kind_and_length_arrive_in_operational_alone() {
     let mut bench = Bench::operational();
@@ -174,8 +174,8 @@ fn an_event_is_a_new_value_or_the_end_of_the_event_timer() {
     }
 }
 
-/// What exists keeps its COB-ID, inhibit time and mapping. Lely's stack and CANopenNode have the same
-/// order; the code for another one differs between the two.
+/// What exists keeps its COB-ID, inhibit time and mapping. Lely's stack and CANopenNode have the
+/// same order; the code for another one differs between the two.
 #[test]
 fn a_pdo_is_changed_by_the_procedure_of_the_standard_alone() {
     const NO_OBJECT: u32 = 0x0602_0000;
@@ -202,7 +202,8 @@ fn a_pdo_is_changed_by_the_procedure_of_the_standard_alone() {
         (0x1400, 1, 0x000, VALUE), (0x1400, 1, 0x180, VALUE), (0x1400, 1, 0x605, VALUE),
         (0x1400, 1, 0x2000_0206, VALUE), (0x1400, 1, 0x0000_0A06, VALUE), (0x1400, 1, 0x206, 0),
         (0x1400, 2, 241, VALUE), (0x1400, 2, 253, VALUE), (0x1400, 2, 254, 0),
-        // A TPDO of more than eight bytes. As those two stacks do, it takes a COB-ID without bit 30.
+        // A TPDO of more than eight bytes. As those two stacks do, it takes a COB-ID without bit
+        // 30.
         (0x1800, 1, 0xC000_0185, 0), (0x1A00, 0, 0, 0), (0x1A00, 1, 0x2004_0008, NOT_MAPPABLE),
         (0x1A00, 1, 0x2003_0040, 0), (0x1A00, 0, 2, PDO_LENGTH), (0x1A00, 0, 1, 0),
         (0x1800, 2, 252, VALUE), (0x1800, 1, 0x285, 0),
