@@ -511,6 +511,7 @@ impl Failure {
     pub(super) fn convert(error: ConvertError, file: &Path) -> Self {
         match error {
             ConvertError::File(error) => error.of(file.display()).into(),
+            ConvertError::Judged(fault) => Self::no_program(file, fault),
             ConvertError::BlockSize { .. }
             | ConvertError::Start(_)
             | ConvertError::Range(_)
@@ -556,7 +557,7 @@ impl From<FileError> for Failure {
     fn from(error: FileError) -> Self {
         let cause = &error.error.cause;
         let text = error.to_string();
-        if let (Cause::Foreign(_) | Cause::Judged(_), Some(advice)) = (cause, cause.advice()) {
+        if let (Cause::Foreign(_), Some(advice)) = (cause, cause.advice()) {
             let what = text.strip_suffix(&format!(": {advice}")).unwrap_or(&text).to_owned();
             return Self::new(Exit::File, what).numbered(cause.number()).advised(advice);
         }

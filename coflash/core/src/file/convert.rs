@@ -164,6 +164,9 @@ pub enum ConvertError {
     /// The file does not fit into the region.
     #[error(transparent)]
     File(#[from] ReadError),
+    /// Data lie outside the region, and their contents name the kind of the image.
+    #[error("{}: {}", .0, .0.advice())]
+    Judged(judge::Fault),
     /// The block size is invalid.
     #[error(
         "a block size of {given} is impossible: it counts the 16 bytes of framing and must be {min} to {max}"
@@ -321,11 +324,9 @@ fn place(image: Image, options: &Options) -> Result<(Image, u32, u64), ConvertEr
             check_range(range)?;
             let image = adjusted(image)?;
             image.check_inside(range).map_err(|error| match error.cause {
-                Cause::Outside { .. } => {
-                    let named = judge::named_image(&image, image.span().first);
-                    error.place.fault(named.map_or(error.cause, Cause::Judged))
-                }
-                _ => error,
+                Cause::Outside { .. } => judge::named_image(&image, image.span().first)
+                    .map_or(ConvertError::File(error), ConvertError::Judged),
+                _ => error.into(),
             })?;
             Ok((image, range.first, 0))
         }

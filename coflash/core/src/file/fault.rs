@@ -6,7 +6,6 @@ use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
 use super::area::{Area, FLASH};
 use super::foreign::Foreign;
-use super::judge;
 use super::range::AddressRange;
 use crate::advice::Advice;
 
@@ -235,9 +234,6 @@ pub enum Cause {
         /// The region of the program.
         region: AddressRange,
     },
-    /// Data outside the region, of an image that its contents name.
-    #[error("{}: {}", .0, .0.advice())]
-    Judged(judge::Fault),
     /// A program for another place of the same region: size and CRC count from its start.
     #[error("the program begins at {linked:#010x}, and the region at {start:#010x}: link the program for that address, or choose another board or program")]
     OtherPlace {
@@ -332,7 +328,6 @@ impl Cause {
             Self::Sealed => Advice::SealedStays,
             Self::NoAddress => Advice::GiveAddress,
             Self::TooSparse { .. } => Advice::SelectRange,
-            Self::Judged(fault) => fault.advice(),
             Self::Foreign(foreign) => foreign.advice.clone(),
             Self::Elsewhere { area, .. } => area.advice(),
             _ => return None,
@@ -366,7 +361,6 @@ impl Cause {
             | Self::TooLarge { .. }
             | Self::NotFirmware
             | Self::Foreign(_)
-            | Self::Judged(_)
             | Self::NotNamedFormat { .. }
             | Self::Encoding(_)
             | Self::Sealed

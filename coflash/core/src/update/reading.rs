@@ -126,6 +126,7 @@ impl Reading {
         let inspection = described.map(|format| Inspection::of(&firmware, format, start, self.board));
         let converted = program_of(firmware, &convert).map_err(|error| match error {
             ConvertError::File(error) => ContentFault::File(error),
+            ConvertError::Judged(fault) => ContentFault::Judged(fault),
             error => ContentFault::Convert(error),
         })?;
         let (program, left_out, notes) = (converted.program, converted.left_out, converted.notes);
