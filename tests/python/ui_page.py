@@ -20,6 +20,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+import zlib
 from pathlib import Path
 
 from playwright.sync_api import expect, sync_playwright
@@ -714,7 +715,7 @@ def service(bench):
     stationed(page, "good")
     expect(page.locator("#search")).to_be_focused()
     expect(page.locator("#number")).to_have_text("Gerätenummer: 4713")
-    expect(page.locator("#saved-count")).to_have_text("2 Berichte sind gespeichert:")
+    expect(page.locator("#saved-count")).to_have_text("3 Berichte sind gespeichert:")
     assert page.evaluate("window.tones") == 2, page.evaluate("window.tones")
     saved = reports(bench)
     assert [rows[0]["serial_number"] for rows in saved.values()] == ["00000100h", "00000101h"], saved
@@ -724,13 +725,26 @@ def service(bench):
         assert (row["operator"], row["order"], row["device_number"]) == ("Jörg", "A-77", "4713"), row
         assert (row["package"], row["release"], row["file"]) == ("Press 4", "2026-11", "machine.cpk"), row
     # The report is that of a user with this language, and needs no script.
-    html = next((bench.folder / "reports").glob("*.html"))
+    html = next((bench.folder / "reports").glob("*_node-5*.html"))
     report = page.context.new_page()
     report.goto(html.as_uri())
     expect(report.locator("h1")).to_have_text("Bericht über ein Update")
     expect(report.locator("body")).to_contain_text("4713")
     bench.picture(report, "service-report")
     report.close()
+    # The sheet of the machine has what sha256sum says of the package, and the token is in no address that is printed.
+    page.context.add_init_script("window.print = () => { window.printed = location.href; }")
+    with page.context.expect_page() as opened:
+        page.get_by_role("link", name="Blatt der Maschine drucken").click()
+    sheet = opened.value
+    sheet.wait_for_function("window.printed")
+    assert url.split("/")[3] not in sheet.evaluate("window.printed"), sheet.url
+    sums = subprocess.run(["sha256sum", package], check=True, capture_output=True, text=True).stdout.split()
+    for part in [sums[0], f"CRC-32 {zlib.crc32(package.read_bytes()):08X}h", "2 von 2 gut", "Nicht signiert", "00000101h", "Probelauf", "Unterschrift", "coflash 0.1.0 ("]:
+        expect(sheet.locator("body")).to_contain_text(part)
+    if bench.arguments.pictures:
+        sheet.pdf(path=f"{bench.arguments.pictures}/ui-service-sheet.pdf", prefer_css_page_size=True)
+    sheet.close()
     # What is done is not done again.
     page.bring_to_front()
     press(page, "Erneut suchen")
@@ -784,6 +798,9 @@ def service_full(bench):
     expect(page.locator("#device-number")).to_have_value("4711")
     back(folder)
     page.get_by_label("Update node 6").uncheck()
+    # A device that was left out is so after a reload.
+    page.reload()
+    expect(page.get_by_label("Update node 6")).not_to_be_checked()
     page.get_by_role("button", name="Update 1 device").click()
     # The disk is full in mid-update, and the browser is closed.
     writing(page)
@@ -791,7 +808,7 @@ def service_full(bench):
     page.context.close()
     page = bench.page(url, locale="en-GB")
     stationed(page, "good-unsaved")
-    expect(page.locator("#unsaved")).to_contain_text("Reports that are not saved: 1.")
+    expect(page.locator("#unsaved")).to_contain_text("Reports that are not saved: 2.")
     expect(page.locator('.device[data-node="6"]')).to_have_attribute("data-state", "state-left-out")
     bench.picture(page, "service-unsaved")
     with page.expect_download() as download:
@@ -818,6 +835,9 @@ def service_full(bench):
     stationed(page, "bad")
     expect(page.locator('.device[data-node="6"]')).to_contain_text("It was stopped.")
     assert sorted(row[0]["result"] for row in reports(bench).values()) == ["failed", "had", "updated"], reports(bench)
+    # What is said is what is so: the device was being written.
+    expect(page.locator("#state")).to_have_text("A device has no program now")
+    expect(page.locator('.device[data-node="6"] .state')).to_have_text("Has no program now")
     program.send_signal(signal.SIGINT)
     assert program.wait(timeout=60) == 0
     expect(page.locator("#lost")).to_be_visible()
@@ -880,7 +900,8 @@ def service_adapters(bench):
     _, url = bench.ui(None, "--service", package, "--report-dir", bench.folder / "reports")
     page = bench.page(url, locale="en-GB")
     # Adapters that this machine does not have.
-    found = [{"url": "socketcan:can9", "words": "CAN interface"}, {"url": "slcan:/dev/none@500k", "words": "Serial adapter"}]
+    found = [{"url": "socketcan:can9", "kind": "port-socketcan", "name": "can9", "product": None, "state": "port-off"},
+             {"url": "slcan:/dev/none@500k", "kind": "port-serial", "name": "/dev/none", "product": "CANable", "state": None}]
 
     def told(route):
         answer = route.fetch()
@@ -891,6 +912,13 @@ def service_adapters(bench):
     expect(page.get_by_label("Adapter")).to_have_value("slcan:/dev/none")
     expect(page.get_by_label("Bit rate")).to_have_value("250k")
     expect(page.locator("#address")).to_be_hidden()
+    # Each has its name, in the language of the user.
+    expect(page.locator("#adapter-list option")).to_have_text(
+        ["CAN interface can9 · switched off", "Serial port /dev/none · CANable", "Another address …"])
+    page.get_by_role("button", name="Deutsch").click()
+    expect(page.locator("#adapter-list option")).to_have_text(
+        ["CAN-Schnittstelle can9 · ausgeschaltet", "Serieller Anschluss /dev/none · CANable", "Andere Adresse …"])
+    page.get_by_role("button", name="English").click()
 
     def asked():
         with page.expect_request("**/open") as request:

@@ -63,6 +63,7 @@ impl Ui {
         options.kinds = context.kinds();
         options.failed = Failed::new(|update| record::failed(update, &[]));
         options.sdo_ids = context.sdo_ids();
+        options.version = env!("COFLASH_VERSION").to_owned();
         self.typed.check(self.service.is_some(), &flash::options())?;
         if let Some(path) = &self.service {
             options.service = Some(self.station(context, path)?);
@@ -94,7 +95,7 @@ impl Ui {
         } else {
             let checked = package::read(path, &self.trusted)?;
             checked.signers().iter().for_each(|line| context.out.say(line));
-            let origin = if checked.known.is_some() { Origin::Trusted } else { Origin::Package };
+            let origin = checked.known.map_or(Origin::Package, Origin::Trusted);
             (checked.package, origin)
         };
         let folder = context

@@ -11,7 +11,15 @@ use coboot_can::{Found, Kind};
 pub(super) struct Listed {
     /// The URL for the field of the page; if the adapter sets the bit rate, the user adjusts it.
     url: String,
+    /// It in English.
     words: String,
+    /// The key of its kind, which says it with its name on this computer: that of a port, an interface or a channel.
+    kind: &'static str,
+    name: String,
+    /// What it calls itself; nothing where that would only be its kind.
+    product: Option<String>,
+    /// The key of its state, if it is unusual; English for one without a key.
+    state: Option<String>,
 }
 
 /// The adapters of these kinds, except servers on the network: their beacons take up to 3 s, and
@@ -21,14 +29,28 @@ pub(super) fn list(kinds: &[Kind]) -> Vec<Listed> {
     coboot_can::list(&kinds, Duration::ZERO).found.into_iter().map(listed).collect()
 }
 
-fn listed(found: Found) -> Listed {
-    let url = match found.kind {
-        Kind::SocketCan | Kind::Socketcand => found.url,
-        Kind::Serial | Kind::Peak | Kind::Kvaser | Kind::GsUsb => format!("{}@500k", found.url),
+fn listed(Found { kind, url, about, state, .. }: Found) -> Listed {
+    let name = url.split_once(':').map_or("", |(_, name)| name).to_owned();
+    let of_state = state.as_ref().map_or(String::new(), |state| format!(", {state}"));
+    let (key, sets_rate) = match kind {
+        Kind::SocketCan | Kind::Socketcand => ("port-socketcan", false),
+        Kind::Serial => ("port-serial", true),
+        Kind::Peak => ("port-peak", true),
+        Kind::Kvaser => ("port-kvaser", true),
+        Kind::GsUsb => ("port-gs-usb", true),
     };
-    let words = match found.state {
-        Some(state) => format!("{}, {state}", found.about),
-        None => found.about,
-    };
-    Listed { url, words }
+    Listed {
+        words: format!("{name}: {about}{of_state}"),
+        url: if sets_rate { format!("{url}@500k") } else { url },
+        kind: key,
+        name,
+        product: Some(about).filter(|about| kind != Kind::SocketCan && about != "serial port"),
+        state: state.map(|state| match &*state {
+            "switched off" => "port-off".to_owned(),
+            "used by another program" => "port-used".to_owned(),
+            "shared with PCAN-View" => "port-shared".to_owned(),
+            "the kernel uses it: see socketcan" => "port-kernel".to_owned(),
+            _ => state,
+        }),
+    }
 }

@@ -63,11 +63,12 @@ impl Guard {
         // elsewhere: the file that leads to it is of another origin.
         let told = |name| values(HeaderName::from_static(name)).collect::<Vec<_>>();
         let is_page = *method == Method::GET && uri.path().splitn(3, '/').nth(2) == Some("");
-        let is_opened =
-            is_page && told("sec-fetch-mode") == ["navigate"] && told("sec-fetch-dest") == ["document"];
-        let is_known = |site: &&str| matches!(*site, "same-origin" | "none");
         let sites = told("sec-fetch-site");
-        if !sites.iter().all(is_known) && !(is_opened && sites == ["cross-site"]) {
+        let is_own = sites.iter().all(|site| matches!(*site, "same-origin" | "none"));
+        let is_opened = is_page
+            && (&*told("sec-fetch-mode"), &*told("sec-fetch-dest")) == (&["navigate"], &["document"])
+            && sites == ["cross-site"];
+        if !is_own && !is_opened {
             return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
         let shown = uri.path().strip_prefix('/').and_then(|path| path.split('/').next()).unwrap_or_default();
@@ -110,7 +111,8 @@ pub(super) async fn guard(State(guard): State<Guard>, request: Request, next: Ne
         },
     };
     for (name, value) in HEADERS {
-        response.headers_mut().insert(name, HeaderValue::from_static(value));
+        // A report has a policy of its own.
+        response.headers_mut().entry(name).or_insert(HeaderValue::from_static(value));
     }
     response
 }

@@ -193,12 +193,13 @@ async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> 
 
 async fn list(State(site): State<Site>) -> Response {
     let boards: Vec<&str> = boards(&site).iter().map(|layout| layout.board).collect();
+    let tool = site.shared.tool.clone();
     let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
     let value = json!({
         "adapters": found,
         "boards": boards,
         "trial": FlashOptions::default().trial_run,
-        "version": env!("CARGO_PKG_VERSION"),
+        "version": tool,
         "file_max": FILE_MAX,
     });
     json_response(StatusCode::OK, &value)

@@ -50,6 +50,8 @@ coflash_core::options! {
         pub sdo_ids: Option<(u16, u16)> = None,
         /// The kinds of adapters that the page offers.
         pub kinds: Vec<Kind> = Kind::ALL.to_vec(),
+        /// The version of the tool for reports, with its commit.
+        pub version: String = env!("CARGO_PKG_VERSION").to_owned(),
         /// A page for people who update machines, in place of the one for engineers.
         pub service: Option<Service> = None,
         /// What is done with what a device has shown whose update has failed.
@@ -100,7 +102,7 @@ impl Server {
         let port = listener.local_addr()?.port();
         let guard = Guard { token: Guard::token().map_err(io::Error::other)?, port };
         let (sender, orders) = sync_channel(4);
-        let shared = Arc::new(Shared::new(sender, options.failed.clone()));
+        let shared = Arc::new(Shared::new(sender, options.failed.clone(), options.version.clone()));
         Ok(Self {
             runtime,
             listener,

@@ -81,6 +81,8 @@ pub(super) struct Shared {
     pub(super) cancelled: Arc<AtomicBool>,
     pub(super) firmware: Mutex<Option<Arc<Loaded>>>,
     pub(super) readback: Mutex<Option<Arc<Vec<u8>>>>,
+    /// The version of the tool, with its commit.
+    pub(super) tool: String,
     failed: Failed,
     orders: SyncSender<Order>,
 }
@@ -92,7 +94,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Shared {
-    pub(super) fn new(orders: SyncSender<Order>, failed: Failed) -> Self {
+    pub(super) fn new(orders: SyncSender<Order>, failed: Failed, tool: String) -> Self {
         Self {
             state: Mutex::default(),
             changed: watch::Sender::new(1),
@@ -101,6 +103,7 @@ impl Shared {
             cancelled: Arc::default(),
             firmware: Mutex::default(),
             readback: Mutex::default(),
+            tool,
             failed,
             orders,
         }

@@ -16,7 +16,8 @@ use coflash_core::device::lss::LssAddress;
 use coflash_core::device::scan::Found;
 use coflash_core::device::state::supply;
 use coflash_core::device::Error;
-use coflash_core::update::Event;
+use coflash_core::update::many::Failed;
+use coflash_core::update::{self, DeviceState, Event};
 
 /// The most reports; the oldest are dropped first.
 const REPORTS: usize = 500;
@@ -43,6 +44,9 @@ pub(super) struct State {
     #[serde(serialize_with = "address")]
     pub(super) lss: Option<LssAddress>,
     pub(super) readback: Option<Readback>,
+    /// What is known of devices whose last update has failed, by node-ID.
+    #[serde(skip)]
+    pub(super) known: BTreeMap<u8, DeviceState>,
     pub(super) reports: Vec<Report>,
 }
 
@@ -268,7 +272,7 @@ pub(super) struct Report {
     pub(super) file_version: Option<String>,
     pub(super) seconds: f64,
     pub(super) adapter: String,
-    pub(super) tool: &'static str,
+    pub(super) tool: String,
 }
 
 impl State {
@@ -310,6 +314,22 @@ impl State {
         let number = self.settings.program;
         for device in self.devices.iter_mut().flat_map(BTreeMap::values_mut) {
             device.verdict = self.firmware.as_ref().map(|file| file.against(device, number));
+            if device.answers && !device.bootloader {
+                self.known.remove(&device.node);
+            }
+        }
+    }
+
+    /// Enters what is known of devices into the results that changed nothing, and remembers the others.
+    pub(super) fn recall(&mut self, nodes: &[NodeId], results: &mut [Result<update::Report, Failed>]) {
+        for (node, result) in nodes.iter().map(|node| node.get()).zip(results) {
+            match result {
+                Err(Failed { left, .. }) if left.state == DeviceState::Untouched => {
+                    left.state = self.known.get(&node).copied().unwrap_or(left.state);
+                }
+                Err(Failed { left, .. }) => drop(self.known.insert(node, left.state)),
+                Ok(_) => drop(self.known.remove(&node)),
+            }
         }
     }
 

@@ -160,12 +160,13 @@ fn update_all(
         });
     };
     let began = wall();
-    let results = match link {
+    let mut results = match link {
         Link::Bus(adapter) => update::flash_many(&mut **adapter, &jobs, &many, &note),
         Link::Gateway(gateway) => update::flash_in_turn(&mut **gateway, &jobs, &many, &note),
     };
     let failed = results.iter().filter(|result| result.is_err()).count();
     shared.change(|state| {
+        state.recall(nodes, &mut results);
         for (update, result) in state.updates.iter_mut().zip(&results) {
             match result {
                 Ok(report) => {
@@ -247,7 +248,7 @@ fn report(
                 file_version: file.shown.version.clone(),
                 seconds: result.as_ref().map_or(took, |report| report.took).as_secs_f64(),
                 adapter: state.adapter.url.clone(),
-                tool: env!("CARGO_PKG_VERSION"),
+                tool: shared.tool.clone(),
             };
             state.report(report);
         }

@@ -12,7 +12,7 @@ use crate::device::Dialect;
 use crate::file::judge::judge;
 use crate::file::sealed::show::digits;
 use crate::file::sealed::{PublicKey, SealedFile, SigningKey};
-use crate::file::{self, Firmware, Format, Target};
+use crate::file::{self, checksum, Firmware, Format, Target};
 use crate::update::dialect::is_data;
 use crate::update::{Marks, Payload};
 use seal::wire::CERTIFICATE;
@@ -21,6 +21,7 @@ use seal::wire::CERTIFICATE;
 #[derive(Clone, Debug)]
 pub struct Package {
     manifest: Manifest,
+    checksums: (String, u32),
     /// The bytes that are signed.
     signed: Vec<u8>,
     signers: Vec<Signer>,
@@ -85,7 +86,8 @@ impl Package {
             programs.push(program(entry, member.bytes)?);
         }
         let marks = programs.iter().map(Payload::marks).collect();
-        Ok(Self { manifest, signed: signed.to_vec(), signers, programs, marks })
+        let checksums = (digits(&Sha256::digest(bytes)), checksum::CRC.checksum(bytes));
+        Ok(Self { checksums, manifest, signed: signed.to_vec(), signers, programs, marks })
     }
 
     /// Checks that one of these roots has signed the package, or certified its signers. Returns the signers
@@ -101,6 +103,12 @@ impl Package {
     #[must_use]
     pub const fn manifest(&self) -> &Manifest {
         &self.manifest
+    }
+
+    /// SHA-256 of its bytes, in 64 hexadecimal digits, and CRC-32 (ISO 3309), as everybody has a tool for.
+    #[must_use]
+    pub fn checksums(&self) -> (&str, u32) {
+        (&self.checksums.0, self.checksums.1)
     }
 
     /// The keys that have signed it.

@@ -39,4 +39,8 @@ function fill() {
 export function start() {
   $("run").addEventListener("change", fill);
   $("print").addEventListener("click", () => window.print());
+  // A browser prints the address of the page, too, and that has the token.
+  const address = location.pathname;
+  addEventListener("beforeprint", () => history.replaceState(null, "", "/"));
+  addEventListener("afterprint", () => history.replaceState(null, "", address));
 }

@@ -14,7 +14,8 @@
 //! | `work` | the search and the update, by `coflash-core` |
 //! | `message` | a key of the table, with its values |
 //! | `trouble` | which message an error has |
-//! | `report` | what became of a device, in HTML and CSV |
+//! | `report` | what became of a device, and of the machine; in CSV |
+//! | `sheet` | the same in HTML, to print and to sign |
 //! | `folder` | the folder of the reports |
 //! | `words` | the table of texts |
 
@@ -31,6 +32,7 @@ mod report;
 mod requests;
 mod row;
 mod setup;
+mod sheet;
 mod station;
 mod trouble;
 mod words;

@@ -1,22 +1,25 @@
-//! The report of a device: what became of it, in HTML for people and in CSV for programs.
+//! The report of a device: what became of it, in HTML for people (`sheet`) and in CSV for programs; and that of the
+//! machine, one sheet to sign.
 
-use std::fmt::Write as _;
 use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::sync::Arc;
 
 use coflash_core::file::inspect::Date;
+use coflash_core::machine::Signer;
+use coflash_core::update::Payload;
 use serde::Deserialize;
 
 use super::folder::Folder;
 use super::message::Message;
 use super::row::{Row, RowState, Step};
-use super::setup::Origin;
+use super::setup::{Origin, Service};
 use super::words::Language;
 
 /// The names of the columns. They are the same in each language, so that a table takes all reports.
 const COLUMNS: &str = "date,result,node,device,vendor_id,product_code,revision,serial_number,program,from,to,\
-                       program_result,error_number,error,operator,order,device_number,package,release,file,adapter,tool";
+                       program_result,error_number,error,operator,order,device_number,package,release,file,adapter,tool,\
+                       device_crc,program_crc,program_sha256,file_crc,file_sha256,signature";
 /// The most characters of what a user enters.
 const ENTERED_MAX: usize = 100;
 
@@ -43,23 +46,30 @@ pub(super) struct Of {
     /// Seconds since 1970, UTC.
     pub(super) date: u64,
     pub(super) entered: Entered,
-    pub(super) origin: Origin,
-    /// The name of the machine in the package.
-    pub(super) package: Option<String>,
-    pub(super) release: Option<String>,
-    pub(super) file: String,
+    pub(super) service: Service,
     pub(super) adapter: String,
+    /// The tool, with its version and its commit.
+    pub(super) tool: String,
     /// What the machine should have and does not.
     pub(super) missing: Vec<Message>,
+}
+
+/// What a report is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// A device whose update has begun, and nothing more is known.
+    Begun,
+    Device,
+    /// All devices.
+    Machine,
 }
 
 /// A report.
 #[derive(Clone, Debug)]
 pub(super) struct Report {
-    row: Row,
-    of: Arc<Of>,
-    /// Whether the update has begun, and nothing more is known.
-    is_begun: bool,
+    pub(super) rows: Vec<Row>,
+    pub(super) of: Arc<Of>,
+    pub(super) kind: Kind,
 }
 
 /// The part of the name of a report about an update that has begun.
@@ -92,45 +102,70 @@ pub(super) fn note_interrupted(rows: &mut [Row], folder: &Folder) {
     }
 }
 
+impl Of {
+    /// Who has signed the package, and whether that was checked.
+    pub(super) fn signature(&self, language: Language) -> String {
+        let Service { package, origin, .. } = &self.service;
+        let line = |signer: &Signer| {
+            let root = signer.certificate().map_or(String::new(), |by| format!(" ({:08X}h)", by.root_id()));
+            let is_known = matches!(origin, Origin::Trusted(known) if known.contains(signer));
+            let checked = language.text(if is_known { "signature-good" } else { "signature-unknown" });
+            format!("{} {:08X}h{root}: {checked}", language.text("signer"), signer.key)
+        };
+        match (origin, package.signers()) {
+            // Nobody can sign one.
+            (Origin::Job, _) => String::new(),
+            (_, []) => language.text("signature-none").to_owned(),
+            (_, signers) => signers.iter().map(line).collect::<Vec<_>>().join("; "),
+        }
+    }
+}
+
 impl Report {
-    pub(super) fn new(row: Row, of: Arc<Of>) -> Self {
-        Self { row, of, is_begun: false }
+    /// The endings of its files.
+    pub(super) const ENDINGS: [&str; 2] = ["html", "csv"];
+
+    /// The reports of an update: one for each device that has a node-ID and was not left out, and that of the machine.
+    pub(super) fn of_all(rows: &[Row], of: &Arc<Of>) -> Vec<Self> {
+        let report = |rows, kind| Self { rows, of: of.clone(), kind };
+        let of_node = rows.iter().filter(|row| row.node.is_some() && row.state != RowState::LeftOut);
+        let devices = of_node.map(|row| report(vec![row.clone()], Kind::Device));
+        devices.chain([report(rows.to_vec(), Kind::Machine)]).collect()
     }
 
     /// The report of an update before its first frame: what is left of one whose computer loses its
     /// power.
     pub(super) fn begun(row: Row, of: Arc<Of>) -> Self {
-        Self { row, of, is_begun: true }
+        Self { rows: vec![row], of, kind: Kind::Begun }
     }
 
-    /// The name of its files: date, node-ID and serial number.
+    /// The name of its files: date, and node-ID and serial number of the device.
     pub(super) fn name(&self) -> String {
         let date = Date(self.of.date).to_string().replace(" UTC", "Z").replace(':', "").replace(' ', "_");
-        let begun = if self.is_begun { BEGUN } else { "" };
-        format!("{date}{}{begun}", of_device(&self.row))
+        let device = self.rows.first().map_or(String::new(), of_device);
+        match self.kind {
+            Kind::Begun => format!("{date}{device}{BEGUN}"),
+            Kind::Device => format!("{date}{device}"),
+            Kind::Machine => format!("{date}_machine"),
+        }
     }
 
-    /// The endings of its files.
-    pub(super) const ENDINGS: [&str; 2] = ["html", "csv"];
-
-    /// The files, each with its ending.
-    pub(super) fn contents(&self) -> [(&'static str, String); 2] {
-        let [html, csv] = Self::ENDINGS;
-        [(html, self.html()), (csv, self.csv())]
-    }
-
-    /// Everything that must not be lost, in one line for the terminal.
+    /// Everything that must not be lost, in one line for the terminal: the machine is its devices.
     pub(super) fn line(&self) -> String {
-        let rows = self.cells();
+        let rows = if self.kind == Kind::Machine { vec![vec![self.name()]] } else { self.cells() };
         rows.iter().map(|cells| cells.join("; ")).collect::<Vec<_>>().join("\n")
     }
 
     /// The cells of a line for each program; of a device that is missing, for the one that it should have.
     fn cells(&self) -> Vec<Vec<String>> {
-        let Self { row, of, is_begun } = self;
-        let Of { date, entered, package, release, file, adapter, .. } = &**of;
+        self.rows.iter().flat_map(|row| self.cells_of(row)).collect()
+    }
+
+    fn cells_of(&self, row: &Row) -> Vec<Vec<String>> {
+        let Of { date, entered, service, adapter, tool, .. } = &*self.of;
+        let (manifest, (sha, crc)) = (service.package.manifest(), service.package.checksums());
         let word = |state: RowState| match state {
-            _ if *is_begun => "begun",
+            _ if self.kind == Kind::Begun => "begun",
             RowState::Updated => "updated",
             RowState::Has if row.interrupted.is_some() => "resumed",
             RowState::Has => "had",
@@ -151,26 +186,35 @@ impl Report {
             entered.operator.clone(),
             entered.order.clone(),
             entered.device_number.clone(),
-            package.clone().unwrap_or_default(),
-            release.clone().unwrap_or_default(),
-            file.clone(),
+            manifest.name.clone().unwrap_or_default(),
+            manifest.release.clone().unwrap_or_default(),
+            service.file.clone(),
             adapter.clone(),
-            format!("coflash {}", env!("CARGO_PKG_VERSION")),
+            tool.clone(),
         ];
-        let line = |program: [String; 4]| [&head[..], &program, &tail].concat();
+        let end = [hex(Some(crc)), sha.to_owned(), self.of.signature(Language::En)];
+        let line =
+            |program: [String; 4], sums: [String; 3]| [&head[..], &program, &tail, &sums, &end].concat();
         if let Some(program) = &row.missing {
             let (from, to) = (String::new(), String::new());
-            return vec![line([program.clone(), from, to, word(row.state).to_owned()])];
+            let program = [program.clone(), from, to, word(row.state).to_owned()];
+            return vec![line(program, Default::default())];
         }
         let of_step = |step: &Step| {
             let (from, to) = (step.from.clone().unwrap_or_default(), step.to.clone());
-            line([step.program.clone(), from, to, word(step.state).to_owned()])
+            let (entry, program) = service.package.programs().nth(step.entry).unzip();
+            let sums = [
+                hex(step.crc),
+                hex(program.map(Payload::crc)),
+                entry.map_or(String::new(), |entry| entry.sha256.clone()),
+            ];
+            line([step.program.clone(), from, to, word(step.state).to_owned()], sums)
         };
         row.steps.iter().map(of_step).collect()
     }
 
     /// CSV (RFC 4180) in UTF-8.
-    fn csv(&self) -> String {
+    pub(super) fn csv(&self) -> String {
         let mut text = format!("{COLUMNS}\r\n");
         for cells in self.cells() {
             let cells: Vec<String> = cells.iter().map(|cell| csv_cell(cell)).collect();
@@ -178,93 +222,6 @@ impl Report {
         }
         text
     }
-
-    /// A page that needs no other file, in the language of the user.
-    fn html(&self) -> String {
-        let Self { row, of, is_begun } = self;
-        let Of { date, entered, origin, package, release, file, adapter, missing } = &**of;
-        let language = entered.language;
-        let text = |key: &'static str| escaped(language.text(key));
-        let unknown = || language.text("report-unknown").to_owned();
-        let result = |state: RowState| match state {
-            _ if *is_begun => ("bad", "report-begun"),
-            RowState::Updated => ("good", "report-good"),
-            RowState::Has if row.interrupted.is_some() => ("good", "report-resumed"),
-            RowState::Has => ("good", "report-had"),
-            _ => ("bad", "report-bad"),
-        };
-        let hex = |part: Option<u32>| part.map_or_else(unknown, |part| format!("{part:08X}h"));
-        let [vendor, product, revision, serial] = row.identity;
-        let parts: Vec<String> = [vendor, product, revision].into_iter().map(hex).collect();
-        let some = |text: &Option<String>| text.clone().unwrap_or_default();
-        let facts: [(&'static str, String); 13] = [
-            ("report-date", Date(*date).to_string()),
-            ("operator", entered.operator.clone()),
-            ("order", entered.order.clone()),
-            ("device-number", entered.device_number.clone()),
-            ("device", row.name.clone().unwrap_or_else(unknown)),
-            ("node", row.node.map_or_else(unknown, |node| node.to_string())),
-            ("serial", hex(serial)),
-            ("identity", parts.join(" / ")),
-            (origin.key(), [&*some(package), &*some(release), file].join(" ").trim().to_owned()),
-            ("report-missing", missing.iter().map(|it| language.message(it)).collect::<Vec<_>>().join(" ")),
-            ("report-interrupted", some(&row.interrupted)),
-            ("report-adapter", adapter.clone()),
-            ("report-tool", format!("coflash {}", env!("CARGO_PKG_VERSION"))),
-        ];
-        let mut page = format!(
-            "<!doctype html>\n<html lang=\"{}\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta http-equiv=\"content-security-policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-             <title>{}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{}</h1>\n\
-             <p class=\"result {}\">{}</p>\n<table>\n",
-            language.code(),
-            text("report-title"),
-            text("report-title"),
-            result(row.state).0,
-            text(result(row.state).1),
-        );
-        for (key, value) in facts.iter().filter(|(_, value)| !value.is_empty()) {
-            let _ = writeln!(page, "<tr><th>{}</th><td>{}</td></tr>", text(key), escaped(value));
-        }
-        page += "</table>\n";
-        if !row.steps.is_empty() {
-            let heads =
-                ["program", "from", "to", "report-result"].map(|key| format!("<th>{}</th>", text(key)));
-            let _ = writeln!(page, "<table>\n<tr>{}</tr>", heads.concat());
-            for step in &row.steps {
-                let from = step.from.as_deref().unwrap_or_else(|| language.text("no-program"));
-                let cells = [&*step.program, from, &*step.to, language.text(result(step.state).1)];
-                let cells = cells.map(|cell| format!("<td>{}</td>", escaped(cell)));
-                let _ = writeln!(page, "<tr>{}</tr>", cells.concat());
-            }
-            page += "</table>\n";
-        }
-        if let Some(trouble) = &row.trouble {
-            let left = row.left.map_or(String::new(), |key| format!(" {}", text(key)));
-            let _ = writeln!(
-                page,
-                "<h2>{}</h2>\n<p>{}{left}</p>\n<p class=\"detail\" lang=\"en\">{}</p>",
-                text("what-happened"),
-                escaped(&language.message(trouble)),
-                escaped(&trouble.original()),
-            );
-        }
-        page += "</body>\n</html>\n";
-        page
-    }
-}
-
-const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;max-width:48rem;margin:2rem auto;padding:0 1rem;color:#1b1f24;background:#fff}\
-                     table{border-collapse:collapse;width:100%;margin:1rem 0}th,td{text-align:left;vertical-align:top;\
-                     padding:.4rem .6rem;border-bottom:1px solid #d0d7de;overflow-wrap:anywhere}th{color:#57606a;font-weight:600}\
-                     .result{font-size:1.3rem;font-weight:700;padding:.6rem 1rem;border-radius:8px}\
-                     .good{background:#dafbe1;color:#116329}.bad{background:#ffebe9;color:#a40e26}.detail{color:#57606a}";
-
-/// Text for HTML.
-fn escaped(text: &str) -> String {
-    let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
-    text.replace('"', "&quot;").replace('\'', "&#39;")
 }
 
 /// A cell of a CSV file. A spreadsheet takes what begins with one of these characters for a formula, and devices
@@ -281,6 +238,9 @@ fn csv_cell(cell: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use coflash_core::machine::{make, Package, Recipe};
+
+    use super::super::sheet::html;
     use super::*;
 
     /// A device that got its program.
@@ -292,6 +252,7 @@ mod tests {
             to: "1.2".to_owned(),
             state: RowState::Updated,
             crc_tells_nothing: false,
+            crc: Some(0x2144_DF1C),
         };
         Row {
             node: Some(node),
@@ -303,18 +264,26 @@ mod tests {
         }
     }
 
-    fn report(name: &str, entered: Entered) -> Report {
+    /// The report of a device, and that of its machine.
+    fn reports(name: &str, entered: Entered) -> Vec<Report> {
+        let recipe = "[[program]]\nname = 'drive'\nimage = 'program.hex'\nnodes = [5]\n";
+        let data = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../core/tests/data"));
+        let parts = Recipe::parse(recipe, data).unwrap().parts().unwrap();
+        let package = Package::parse(&make(None, None, &parts, &[]).unwrap()).unwrap();
+        let folder = std::env::temp_dir().join(format!("coflash-report-{}", std::process::id()));
         let of = Of {
             date: 1_420_070_400,
             entered,
-            origin: Origin::Job,
-            package: Some("Press 4".to_owned()),
-            release: None,
-            file: "press.cpk".to_owned(),
+            service: Service::new(package, "press.toml".as_ref(), Origin::Job, &folder).unwrap(),
             adapter: "socketcan:can0".to_owned(),
+            tool: "coflash 1.2.3 (0123456789ab)".to_owned(),
             missing: Vec::new(),
         };
-        Report::new(row(5, name), Arc::new(of))
+        Report::of_all(&[row(5, name)], &Arc::new(of))
+    }
+
+    fn report(name: &str, entered: Entered) -> Report {
+        reports(name, entered).remove(0)
     }
 
     /// A device names itself as it likes: its report has this as text.
@@ -325,7 +294,7 @@ mod tests {
         let report = report("<script>alert(1)</script>", entered);
         // The date of GNU `date -u -d @1420070400`.
         assert_eq!(report.name(), "2015-01-01_000000Z_node-5_00000105h");
-        let [(_, html), (_, csv)] = report.contents();
+        let (html, csv) = (html(&report), report.csv());
         assert!(
             !html.contains("<script") && html.contains("&lt;script&gt;alert(1)&lt;/script&gt;"),
             "{html}"
@@ -333,7 +302,7 @@ mod tests {
         assert!(csv.contains(",'=1+1,\"a\"\"b,c\","), "{csv}");
         let lines: Vec<&str> = csv.split("\r\n").collect();
         assert_eq!((lines.len(), lines[2]), (3, ""));
-        assert_eq!(lines[0].split(',').count(), 22);
+        assert_eq!(lines[0].split(',').count(), 28);
     }
 
     /// The language is that of the user, and the columns of the table are always the same.
@@ -341,13 +310,29 @@ mod tests {
     fn a_report_is_in_the_language_of_the_user() {
         let german = report("x", Entered { language: Language::De, ..Entered::default() });
         let english = report("x", Entered::default());
-        let html = |report: &Report| report.contents()[0].1.clone();
         assert!(html(&german).contains("lang=\"de\"") && html(&german).contains("Seriennummer"));
         assert!(html(&english).contains("lang=\"en\"") && html(&english).contains("Serial number"));
         // What the programs came from has its name in either language.
         assert!(html(&german).contains("Job-Datei") && html(&english).contains("Job file"));
         assert!(html(&german).contains("<th>Software</th>") && html(&english).contains("<th>Tool</th>"));
         assert_eq!(german.csv(), english.csv());
+    }
+
+    /// What a quality department asks of it.
+    #[test]
+    fn the_machine_has_one_sheet_with_what_was_verified_and_a_place_to_sign() {
+        let sheet = reports("x", Entered::default()).pop().unwrap();
+        assert_eq!(sheet.name(), "2015-01-01_000000Z_machine");
+        let page = html(&sheet);
+        for part in [
+            "coflash 1.2.3 (0123456789ab)",
+            "2144DF1Ch",
+            "<h2>Verified</h2>",
+            "1 of 1 good",
+            "class=\"sign\"",
+        ] {
+            assert!(page.contains(part), "{part}: {page}");
+        }
     }
 
     #[test]

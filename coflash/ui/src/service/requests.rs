@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use axum::body::Bytes;
 use axum::extract::{Query, State};
-use axum::http::{HeaderMap, StatusCode};
-use axum::response::Response;
+use axum::http::{header, HeaderMap, StatusCode};
+use axum::response::{IntoResponse as _, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
 use canopen::NodeId;
@@ -17,6 +17,7 @@ use serde_json::json;
 
 use super::report::Entered;
 use super::setup::Origin;
+use super::sheet::{html, POLICY};
 use super::station::{change, Stage, Station};
 use super::words::TABLE;
 use super::work::{is_due, Search, Update};
@@ -25,11 +26,12 @@ use crate::http::{bad, body, done, download, idle, json_response, node_id, passw
 use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
 use crate::shared::Order;
 
-const FILES: [(&str, &str, &str); 10] = [
+const FILES: [(&str, &str, &str); 11] = [
     ("", HTML, concat!(include_str!("../page/head.html"), include_str!("page/service.html"))),
     ("colours.css", CSS, include_str!("../page/colours.css")),
     ("service.css", CSS, include_str!("page/service.css")),
     ("service.js", SCRIPT, include_str!("page/service.js")),
+    ("sheet.js", SCRIPT, include_str!("page/sheet.js")),
     ("words.json", "application/json", TABLE),
     ("icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
     ("dom.js", SCRIPT, include_str!("../page/dom.js")),
@@ -47,6 +49,7 @@ pub(super) fn page(station: &Arc<Station>) -> Page {
         .route("/update", post(update))
         .route("/save", post(save))
         .route("/report", get(report))
+        .route("/sheet", get(sheet))
         .layer(Extension(station.clone()));
     let view = {
         let station = station.clone();
@@ -57,11 +60,12 @@ pub(super) fn page(station: &Arc<Station>) -> Page {
 
 /// What does not change while the station runs, and the adapters.
 async fn describe(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Response {
+    let tool = site.shared.tool.clone();
     let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
     let service = &station.service;
     let manifest = service.package.manifest();
-    let signature = match (service.origin, service.package.signers()) {
-        (Origin::Trusted, _) => Some("signature-good"),
+    let signature = match (&service.origin, service.package.signers()) {
+        (Origin::Trusted(_), _) => Some("signature-good"),
         (Origin::Package, []) => Some("signature-none"),
         (Origin::Package, _) => Some("signature-unknown"),
         // Nobody can sign one.
@@ -83,7 +87,7 @@ async fn describe(State(site): State<Site>, Extension(station): Extension<Arc<St
             "programs": programs.collect::<Vec<_>>(),
         },
         "folder": service.report_dir().display().to_string(),
-        "version": env!("CARGO_PKG_VERSION"),
+        "version": tool,
     });
     json_response(StatusCode::OK, &value)
 }
@@ -179,6 +183,16 @@ async fn report(
         let (words, advice) = ("there is no such report", "it may have been saved meanwhile");
         return Err(Refused::new(StatusCode::NOT_FOUND, words, advice));
     };
-    let [(ending, html), _] = report.contents();
-    Ok(download(&format!("{}.{ending}", report.name()), "text/html; charset=utf-8", html))
+    Ok(download(&format!("{}.html", report.name()), HTML, html(&report)))
+}
+
+/// The report of the machine, for the browser to print.
+async fn sheet(Extension(station): Extension<Arc<Station>>) -> Answer {
+    let Some(report) = station.sheet() else {
+        let (words, advice) = ("there was no update yet", "update the devices first");
+        return Err(Refused::new(StatusCode::NOT_FOUND, words, advice));
+    };
+    let page = html(&report).replacen("</head>", "<script src=\"sheet.js\" defer></script>\n</head>", 1);
+    let head = [(header::CONTENT_TYPE, HTML), (header::CONTENT_SECURITY_POLICY, POLICY)];
+    Ok((head, page).into_response())
 }

@@ -1,5 +1,7 @@
 //! The devices of a plan or an update, as the page and the reports have them.
 
+use std::collections::BTreeMap;
+
 use canopen::NodeId;
 use coflash_core::machine::{Foreign, Good, Outcome, Plan, Stranger, Todo};
 use serde::Serialize;
@@ -28,6 +30,8 @@ pub(super) struct Row {
     pub(super) trouble: Option<Message>,
     /// The key of what is in the device after that.
     pub(super) left: Option<&'static str>,
+    /// The key of [`Self::outcome`], for the page.
+    pub(super) says: &'static str,
     /// In percent, while it is being written.
     pub(super) percent: Option<usize>,
 }
@@ -55,32 +59,44 @@ pub(super) struct Step {
     pub(super) state: RowState,
     /// Whether it is written because its CRC is that of each of its versions.
     pub(super) crc_tells_nothing: bool,
+    /// What the device has reported of it after the update: its CRC (1F56h).
+    #[serde(skip)]
+    pub(super) crc: Option<u32>,
 }
 
-/// The state of a device or of one of its programs, with its key in the table.
+/// The state of a device or of one of its programs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(into = "&'static str")]
 pub(super) enum RowState {
     /// It has its program already.
     #[default]
-    #[serde(rename = "state-has")]
     Has,
     /// It would get its program.
-    #[serde(rename = "state-due")]
     Due,
     /// It has a newer program, and gets the older one if the user wants it.
-    #[serde(rename = "state-older")]
     Older,
     /// It would get its program, and the user has left it out.
-    #[serde(rename = "state-left-out")]
     LeftOut,
-    #[serde(rename = "state-waiting")]
     Waiting,
-    #[serde(rename = "state-working")]
     Working,
-    #[serde(rename = "state-updated")]
     Updated,
-    #[serde(rename = "state-failed")]
     Failed,
+}
+
+/// The key in the table.
+impl From<RowState> for &'static str {
+    fn from(state: RowState) -> Self {
+        match state {
+            RowState::Has => "state-has",
+            RowState::Due => "state-due",
+            RowState::Older => "state-older",
+            RowState::LeftOut => "state-left-out",
+            RowState::Waiting => "state-waiting",
+            RowState::Working => "state-working",
+            RowState::Updated => "state-updated",
+            RowState::Failed => "state-failed",
+        }
+    }
 }
 
 /// The devices of a plan, and what is missing.
@@ -91,6 +107,7 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             program: step.program.clone(),
             from: step.from.clone(),
             to: step.to.clone(),
+            crc: None,
             state: match step.todo {
                 Todo::Has => RowState::Has,
                 Todo::Update => RowState::Due,
@@ -146,6 +163,18 @@ impl Row {
         self.state = first.unwrap_or(self.state);
     }
 
+    /// The key of what became of it, or will: of a device whose update has failed, what it has now.
+    pub(super) fn outcome(&self) -> &'static str {
+        match (self.state, self.left) {
+            (RowState::Failed, Some("left-none")) => "state-empty",
+            (RowState::Failed, Some("left-new")) => "state-new",
+            (RowState::Failed, Some("left-unknown")) => "state-unknown",
+            (RowState::Failed, None) if self.missing.is_some() => "state-missing",
+            (RowState::Failed, None) => "state-left-alone",
+            (state, _) => state.into(),
+        }
+    }
+
     /// Takes a device into the update, or leaves it out.
     pub(super) fn choose(&mut self, is_chosen: bool) {
         let next = if is_chosen { RowState::Waiting } else { RowState::LeftOut };
@@ -178,7 +207,11 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
         let Some(row) = rows.iter_mut().find(|row| row.is_of(outcome)) else { continue };
         let state = match &outcome.result {
             Ok(Good::Had) => RowState::Has,
-            Ok(Good::Updated(_)) => RowState::Updated,
+            Ok(Good::Updated(report)) => {
+                let crc = Some(report.program_crc).filter(|_| report.renewal.is_none());
+                row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|it| it.crc = crc);
+                RowState::Updated
+            }
             Err(bad) => {
                 // The first reason counts: the programs after it were not begun.
                 if row.trouble.is_none() {
@@ -190,5 +223,48 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
         };
         row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|step| step.state = state);
         row.sum();
+    }
+}
+
+/// The keys of what became of all devices of an update, and of what to do next.
+pub(super) fn headline(rows: &[Row]) -> (&'static str, &'static str) {
+    let has = |state| rows.iter().any(|row| row.state == state);
+    let is_stopped = |row: &Row| row.trouble.as_ref().is_none_or(|why| why.key == "trouble-cancelled");
+    match () {
+        () if rows.iter().any(|row| row.outcome() == "state-empty") => ("bad-empty", "hint-bad-empty"),
+        () if has(RowState::Failed) && rows.iter().all(is_stopped) => ("stopped", "hint-stopped"),
+        () if has(RowState::Failed) && !has(RowState::Updated) => ("bad-none", "hint-bad"),
+        () if has(RowState::Failed) => ("bad", "hint-bad"),
+        () if has(RowState::LeftOut) => ("good-part", "hint-good-part"),
+        () => ("good", "hint-good"),
+    }
+}
+
+/// What is known of devices whose last update has failed, by node-ID: 1018h/4, and the key of what they have.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Known(BTreeMap<u8, (Option<u32>, &'static str)>);
+
+impl Known {
+    /// Enters it into the devices that were not asked since then, remembers what is known of the others, and has each
+    /// row say so.
+    pub(super) fn recall(&mut self, rows: &mut [Row]) {
+        for row in rows {
+            let (node, serial) = (row.node.unwrap_or(0), row.identity[3]);
+            // What a device says that has a program is right.
+            let has_program = row.steps.iter().any(|step| step.from.is_some());
+            match (row.state, row.left) {
+                (RowState::Failed, None | Some("left-untouched")) => {
+                    let known = self.0.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
+                    row.left = known.map(|(_, left)| *left).or(row.left);
+                }
+                (RowState::Failed, Some(left)) => drop(self.0.insert(node, (serial, left))),
+                (RowState::Due, _) if !has_program => {}
+                (RowState::Updated | RowState::Has | RowState::Due | RowState::Older, _) => {
+                    self.0.remove(&node);
+                }
+                _ => {}
+            }
+            row.says = row.outcome();
+        }
     }
 }

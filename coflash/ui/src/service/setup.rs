@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::{fs, io};
 
-use coflash_core::machine::Package;
+use coflash_core::machine::{Package, Signer};
 
 use super::folder::Folder;
 
@@ -12,10 +12,10 @@ use super::folder::Folder;
 const URL_MAX: usize = 1000;
 
 /// Where the programs of a station come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// A package that a root which the user trusts has signed.
-    Trusted,
+    /// A package that a root which the user trusts has signed, with the signers of these roots.
+    Trusted(Vec<Signer>),
     /// Any other package.
     Package,
     /// A job file.
@@ -24,9 +24,9 @@ pub enum Origin {
 
 impl Origin {
     /// The key of what the file is.
-    pub(super) const fn key(self) -> &'static str {
+    pub(super) const fn key(&self) -> &'static str {
         match self {
-            Self::Trusted | Self::Package => "package",
+            Self::Trusted(_) | Self::Package => "package",
             Self::Job => "job-file",
         }
     }

@@ -7,9 +7,10 @@ use coflash_core::machine::{Entry, Plan};
 use serde_json::{json, Value};
 
 use super::message::Message;
-use super::report::{self, Of, Report};
-use super::row::{self, Row, RowState};
+use super::report::{self, Kind, Of, Report};
+use super::row::{self, headline, Known, Row, RowState};
 use super::setup::Service;
+use super::sheet::contents;
 use crate::shared::{lock, Shared};
 use crate::state;
 
@@ -41,7 +42,11 @@ pub(super) struct State {
     pub(super) device_number: String,
     /// Whether a device of this machine needs a password: the page has a field for it, and nothing keeps it.
     pub(super) asks_password: bool,
-    /// The names of the saved reports of the last update.
+    /// What is known of devices from earlier updates.
+    pub(super) known: Known,
+    /// The report of the machine of the last update.
+    sheet: Option<Report>,
+    /// The names of the saved reports of the last update, with their endings.
     saved: Vec<String>,
     /// The number of reports that could not be saved.
     unsaved: usize,
@@ -86,7 +91,7 @@ impl Station {
         let mut begun = lock(&self.begun);
         for row in rows.iter().filter(|row| row.state == RowState::Waiting) {
             let report = Report::begun(row.clone(), of.clone());
-            match folder.save(&report.name(), &report.contents()) {
+            match folder.save(&report.name(), &contents(&report)) {
                 Ok(name) => begun.push(name),
                 Err(error) => {
                     begun.drain(..).for_each(|name| folder.remove(&name, Report::ENDINGS));
@@ -99,7 +104,10 @@ impl Station {
 
     /// Keeps reports, and saves them.
     pub(super) fn keep(&self, reports: Vec<Report>) {
-        self.change(|state| state.saved.clear());
+        self.change(|state| {
+            state.saved.clear();
+            state.sheet = reports.iter().find(|report| report.kind == Kind::Machine).cloned();
+        });
         lock(&self.unsaved).extend(reports);
         self.save();
     }
@@ -109,9 +117,9 @@ impl Station {
         let mut unsaved = lock(&self.unsaved);
         let mut saved = Vec::new();
         let mut why = None;
-        unsaved.retain(|report| match self.service.folder.save(&report.name(), &report.contents()) {
+        unsaved.retain(|report| match self.service.folder.save(&report.name(), &contents(report)) {
             Ok(name) => {
-                saved.push(name);
+                saved.push(name + if report.kind == Kind::Machine { ".html" } else { ".html, .csv" });
                 false
             }
             Err(error) => {
@@ -145,10 +153,15 @@ impl Station {
         lock(&self.unsaved).get(number).cloned()
     }
 
+    /// The report of the machine of the last update.
+    pub(super) fn sheet(&self) -> Option<Report> {
+        lock(&self.state).sheet.clone()
+    }
+
     /// What the page shows.
     pub(super) fn view(&self, shown: &state::State) -> Value {
         use state::Connection;
-        let own = lock(&self.state);
+        let mut own = lock(&self.state);
         let adapter = &shown.adapter;
         let (mut rows, mut number, mut others) = (Vec::new(), None, Vec::new());
         match &own.stage {
@@ -159,18 +172,20 @@ impl Station {
             }
             Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
         }
+        own.known.recall(&mut rows);
         let due = rows.iter().filter(|row| matches!(row.state, RowState::Due | RowState::Older)).count();
         if matches!(own.stage, Stage::Working(_)) {
             rows.iter_mut().for_each(|row| row.advance(&shown.updates));
         }
         let is_busy = shown.task.is_some();
         let is_good = |row: &Row| !matches!(row.state, RowState::Failed);
+        let ended = headline(&rows);
         let (station, hint) = match (&own.stage, adapter.state) {
             (Stage::Searching, _) if is_busy => ("searching", None),
             (Stage::Working(_), _) if is_busy => ("working", Some("hint-working")),
-            (Stage::Ended(rows), _) if !rows.iter().all(is_good) => ("bad", Some("hint-bad")),
+            (Stage::Ended(rows), _) if !rows.iter().all(is_good) => ("bad", Some(ended.1)),
             (Stage::Ended(_), _) if own.unsaved > 0 => ("good-unsaved", Some("hint-good-unsaved")),
-            (Stage::Ended(_), _) => ("good", Some("hint-good")),
+            (Stage::Ended(_), _) => ("good", Some(ended.1)),
             // An update without a task was ended by an internal error.
             (Stage::Working(_), _) => ("bad", Some("hint-bad")),
             (_, Connection::Closed) => ("closed", Some("hint-closed")),
@@ -192,6 +207,8 @@ impl Station {
             }
             (Stage::Planned { .. }, Connection::Open) => ("planned-bad", Some("hint-incomplete")),
         };
+        // The state of an update that has ended is said as it has ended.
+        let says = if matches!(station, "good" | "bad") { ended.0 } else { station };
         let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
         let message = match (&adapter.words, &own.message, notice) {
             (Some(words), _, _) => Some(Message::new("adapter-lost").detail(words)),
@@ -204,6 +221,7 @@ impl Station {
         };
         json!({
             "station": station,
+            "says": says,
             "hint": hint,
             "message": message,
             "adapter": adapter.url,
@@ -217,6 +235,7 @@ impl Station {
             "rows": rows,
             "others": others,
             "saved": own.saved,
+            "sheet": own.sheet.is_some(),
             "unsaved": own.unsaved,
             "why": own.why,
         })
@@ -226,10 +245,4 @@ impl Station {
 /// Changes the state, and notifies all pages.
 pub(super) fn change<R>(shared: &Shared, station: &Station, change: impl FnOnce(&mut State) -> R) -> R {
     shared.change(|_| station.change(change))
-}
-
-/// The reports of an update: one for each device that has a node-ID and was not left out.
-pub(super) fn reports(rows: &[Row], of: &Arc<Of>) -> Vec<Report> {
-    let of_node = rows.iter().filter(|row| row.node.is_some() && row.state != RowState::LeftOut);
-    of_node.map(|row| Report::new(row.clone(), of.clone())).collect()
 }

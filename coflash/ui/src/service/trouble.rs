@@ -1,9 +1,10 @@
 //! Which message an error has: what a person at the machine can do about it.
 
+use canopen::program::ProgramState;
 use coflash_core::device::error::TrialFailure;
 use coflash_core::device::{Doing, Error};
 use coflash_core::machine::{Bad, DeviceFault, Missing, Outcome};
-use coflash_core::update::DeviceState;
+use coflash_core::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 
 use super::message::Message;
 
@@ -86,13 +87,17 @@ pub(super) fn of_outcome(bad: &Bad) -> (Message, Option<&'static str>) {
         Bad::Failed(failed) => {
             let message =
                 of_error(&failed.error).detail(format!("{}. The device: {}", failed.error, failed.left));
-            (message, Some(left(failed.left.state)))
+            (message, Some(left(failed.left)))
         }
     }
 }
 
-const fn left(state: DeviceState) -> &'static str {
-    match state {
+fn left(after: DeviceAfterUpdate) -> &'static str {
+    // The device's own answer counts.
+    let is_empty = matches!(after.answer, DeviceAnswer::Given(answers)
+        if answers.crc == Some(0) || answers.control == Some(ProgramState::Absent as u32));
+    match after.state {
+        DeviceState::Called | DeviceState::Postponed if is_empty => "left-none",
         DeviceState::Untouched => "left-untouched",
         DeviceState::Called => "left-old",
         DeviceState::Postponed | DeviceState::Begun => "left-unknown",

@@ -52,57 +52,35 @@ impl Language {
 
     /// A message in this language.
     pub(super) fn message(self, message: &Message) -> String {
-        let mut parts = self.text(message.key).split('{');
-        let mut filled = parts.next().unwrap_or_default().to_owned();
-        // What is filled in may have braces, and is not filled in again.
-        for (name, rest) in parts.filter_map(|part| part.split_once('}')) {
-            filled.push_str(message.values.get(name).map_or("", String::as_str));
-            filled.push_str(rest);
-        }
-        filled
+        filled(self.text(message.key), |name| message.values.get(name).cloned().unwrap_or_default())
     }
+}
+
+/// A text with a value for each name in braces. What is filled in may have braces, and is not filled in again.
+pub(super) fn filled(text: &'static str, value: impl Fn(&'static str) -> String) -> String {
+    let mut parts = text.split('{');
+    let first = parts.next().unwrap_or_default().to_owned();
+    let parts = parts.filter_map(|part| part.split_once('}'));
+    parts.fold(first, |all, (name, rest)| all + &value(name) + rest)
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
 
+    use super::super::sheet::PAGE as SHEET;
     use super::*;
 
     const PAGE: &str = include_str!("page/service.html");
     const SCRIPT: &str = include_str!("page/service.js");
-    /// The modules that name texts. All their literals of small letters with a dash are keys.
-    /// The keys of one word in the modules, which look like any other string there.
-    const SHORT: &[&str] = &[
-        "bad",
-        "closed",
-        "complete",
-        "device",
-        "from",
-        "gateway",
-        "good",
-        "identity",
-        "internal",
-        "lost",
-        "node",
-        "none",
-        "opening",
-        "operator",
-        "order",
-        "package",
-        "planned",
-        "program",
-        "ready",
-        "searching",
-        "serial",
-        "to",
-        "working",
-    ];
-    const MODULES: [&str; 7] = [
+    /// The modules that name texts: by literals of small letters with a dash, or of one word.
+    const MODULES: [&str; 9] = [
+        include_str!("../adapters.rs"),
         include_str!("report.rs"),
         include_str!("requests.rs"),
         include_str!("row.rs"),
         include_str!("setup.rs"),
+        include_str!("sheet.rs"),
         include_str!("station.rs"),
         include_str!("trouble.rs"),
         include_str!("work.rs"),
@@ -148,7 +126,7 @@ mod tests {
         let speaks = |text: &Text| text.en.to_lowercase().contains("package") || text.de.contains("Paket");
         let keys: Vec<&str> =
             TEXTS.iter().filter(|(_, text)| speaks(text)).map(|(key, _)| key.as_str()).collect();
-        assert_eq!(keys, ["package"]);
+        assert_eq!(keys, ["package", "verified-package"]);
     }
 
     /// Each key of the page and of the server is in the table, and the table has no other one.
@@ -159,15 +137,14 @@ mod tests {
             used.extend(after(PAGE, attribute));
         }
         used.extend(after(SCRIPT, " t(\"").into_iter().chain(after(SCRIPT, "(t(\"")));
+        used.extend(names(SHEET).into_iter().filter(|name| !name.starts_with('=')));
         let known: BTreeSet<&str> = TEXTS.keys().map(String::as_str).collect();
         let is_key = |word: &str| {
             let is_letters = |part: &str| !part.is_empty() && part.bytes().all(|c| c.is_ascii_lowercase());
             word.contains('-') && word.split('-').all(is_letters)
         };
         let literals = MODULES.iter().flat_map(|module| module.split('"'));
-        let literals: BTreeSet<&str> = literals.filter(|word| SHORT.contains(word) || is_key(word)).collect();
-        assert!(SHORT.iter().all(|key| literals.contains(key)), "a key of one word is in no module");
-        used.extend(literals);
+        used.extend(literals.filter(|word| known.contains(word) || is_key(word)));
         assert_eq!(used.difference(&known).collect::<Vec<_>>(), Vec::<&&str>::new(), "not in the table");
         assert_eq!(known.difference(&used).collect::<Vec<_>>(), Vec::<&&str>::new(), "not used");
     }

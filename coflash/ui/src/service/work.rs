@@ -12,9 +12,9 @@ use coflash_core::update::{Event, FlashOptions, ManyOptions, Password};
 use coflash_core::Error;
 
 use super::message::Message;
-use super::report::{note_interrupted, unsaved, Entered, Of};
+use super::report::{note_interrupted, unsaved, Entered, Of, Report};
 use super::row::{note, rows, Row};
-use super::station::{change, reports, Stage, Station};
+use super::station::{change, Stage, Station};
 use super::trouble;
 use crate::shared::{Shared, Work};
 use crate::state::{self, Notice, Phase};
@@ -144,7 +144,8 @@ impl Work for Update {
         if let Some(message) = station.save() {
             return refused(station, shared, back(), message);
         }
-        if let Err(error) = service.folder.check(2 * rows.len()) {
+        // Each device has a report that its update has begun, and one of its end, which the machine's repeats.
+        if let Err(error) = service.folder.check(3 * rows.len()) {
             return refused(station, shared, back(), unsaved(&error, service.folder.path()));
         }
         let _locks = match locked(shared, self.nodes.iter().copied()) {
@@ -152,15 +153,12 @@ impl Work for Update {
             Err(message) => return refused(station, shared, back(), message),
         };
         note_interrupted(&mut rows, &service.folder);
-        let manifest = service.package.manifest();
         let of = Arc::new(Of {
             date: wall().as_secs(),
             entered: self.entered.clone(),
-            origin: service.origin,
-            package: manifest.name.clone(),
-            release: manifest.release.clone(),
-            file: service.file.clone(),
+            service: service.clone(),
             adapter: shared.read(|state| state.adapter.url.clone()),
+            tool: format!("coflash {}", shared.tool),
             missing: self.plan.missing.iter().map(trouble::of_missing).collect(),
         });
         if let Some(message) = station.begin(&rows, &of) {
@@ -178,10 +176,11 @@ impl Work for Update {
         let options = RunOptions::default().flash(FlashOptions::default().unlock(self.unlock)).many(many);
         let outcomes = machine::run(&mut **adapter, &service.package, &self.chosen(), &options, &on_event);
         note(&mut rows, &outcomes);
+        station.change(|own| own.known.recall(&mut rows));
         if outcomes.iter().any(trouble::is_locked) {
             station.change(|own| own.asks_password = true);
         }
-        station.keep(reports(&rows, &of));
+        station.keep(Report::of_all(&rows, &of));
         shared.change(|state| {
             for update in &mut state.updates {
                 let row = rows.iter().find(|row| row.node == Some(update.node));

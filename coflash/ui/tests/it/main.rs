@@ -16,7 +16,7 @@ use coflash_ui::{Failed, Options, Server};
 use serde_json::{json, Value};
 
 use kit::fake::vault::Vault;
-use kit::fake::Fake;
+use kit::fake::{Bus, Fake, Outcome};
 
 /// How long something may take before it counts as hanging. It measures nothing.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -703,6 +703,28 @@ fn a_second_update_is_refused_while_one_runs() {
     let words = state["updates"][0]["words"].as_str().unwrap();
     assert!(words.contains("cancelled") && words.contains("The device: "), "{words}");
     assert_eq!(state["reports"][0]["ok"], false);
+}
+
+/// A device loses its program in an update that fails, and is not on the bus in the next one.
+#[test]
+fn what_is_known_of_a_device_outlives_its_update() {
+    let mut device = Fake::new(kit::fake::BOOTLOADER);
+    device.on_block = Box::new(|_| Outcome::Status(0x06));
+    let (bus, _server) = kit::fake::serve(device);
+    let (empty, _server) = kit::fake::serve(Bus(Vec::new()));
+    let ui = Ui::new(None);
+    ui.file("app.hex", HEX);
+    for (number, url) in [bus, empty].iter().enumerate() {
+        ui.post("open", &json!({ "url": url }));
+        let is_open = |state: &Value| state["adapter"]["url"] == **url && state["adapter"]["state"] == "open";
+        ui.until("the adapter", is_open);
+        ui.post("update", &json!({ "nodes": [kit::fake::NODE], "trial": false, "start": true }));
+        let ended =
+            |state: &Value| state["task"].is_null() && state["reports"].as_array().unwrap().len() > number;
+        let state = ui.until("the end", ended);
+        let words = state["reports"][number]["words"].as_str().unwrap();
+        assert!(words.contains("it contains no complete program"), "{words}");
+    }
 }
 
 /// Ctrl-C during an update ends it in an orderly way, and reports the state of the device.

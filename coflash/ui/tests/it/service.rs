@@ -63,9 +63,8 @@ const DRIVES: &str =
 
 /// A station with the reports, and what it remembers, in this folder.
 fn station(folder: &Folder, package: Package, bus: Option<String>) -> Ui {
-    let service =
-        Service::new(package, "press.cpk".as_ref(), Origin::Package, &folder.join("reports")).unwrap();
-    let service = service.memory(Some(folder.join("bus")));
+    let service = Service::new(package, "press.cpk".as_ref(), Origin::Package, &folder.join("reports"));
+    let service = service.unwrap().memory(Some(folder.join("bus")));
     Ui::with(|options| (options.bus, options.service) = (bus, Some(service)))
 }
 
@@ -194,7 +193,10 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     let state = ended(&ui);
     assert_eq!(rows(&state), [(5, "state-updated"), (6, "state-has"), (9, "state-failed")]);
     assert_eq!((&state["station"], &state["message"]), (&json!("bad"), &Value::Null));
-    assert_eq!((&state["unsaved"], state["saved"].as_array().unwrap().len()), (&json!(0), 3));
+    // Three devices, and the sheet of the machine.
+    assert_eq!((&state["unsaved"], state["saved"].as_array().unwrap().len()), (&json!(0), 4));
+    // What is said follows the outcome: here a device is missing.
+    assert_eq!((&state["says"], &state["rows"][2]["says"]), (&json!("bad"), &json!("state-missing")));
     // It cannot be confirmed a second time.
     assert_eq!(confirm(&ui, &newer, &[5]).status, 409);
     let reports = saved(&folder, "csv");
@@ -214,7 +216,16 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     );
     assert!(reports[2].1.contains(",panel,,,failed,0x60000013,"), "{}", reports[2].1);
     let pages = saved(&folder, "html");
-    assert_eq!(pages.len(), 3);
+    assert_eq!(pages.len(), 4);
+    let sheet = ui.get("sheet");
+    assert!(
+        sheet.status == 200 && sheet.body.contains("Unterschrift") && pages[0].0.ends_with("_machine.html")
+    );
+    assert!(
+        sheet.head.contains("style-src 'unsafe-inline'") && sheet.body.contains("Knoten 9"),
+        "{}",
+        sheet.head
+    );
     assert!(pages.iter().all(|(_, page)| page.contains("lang=\"de\"") && page.contains("4711")), "{pages:?}");
     let missing = "Knoten 9 (panel): Das Gerät ist nicht am Bus.";
     assert!(pages.iter().all(|(_, page)| page.contains(missing)), "{pages:?}");
@@ -360,20 +371,20 @@ fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
     fs::rename(&reports, &away).unwrap();
     fs::write(&reports, "").unwrap();
     let state = ended(&ui);
-    assert_eq!((&state["station"], &state["unsaved"]), (&json!("good-unsaved"), &json!(1)));
+    assert_eq!((&state["station"], &state["unsaved"]), (&json!("good-unsaved"), &json!(2)));
     assert_eq!(state["why"]["key"], "not-saved");
     // A browser may save it, and it is still kept.
     let report = ui.get("report?number=0");
     assert!(report.status == 200 && report.body.contains("000003EDh"), "{}", report.body);
     assert!(report.head.contains("content-disposition: attachment"), "{}", report.head);
-    assert_eq!(ui.get("report?number=1").status, 404);
+    assert_eq!(ui.get("report?number=2").status, 404);
     assert_eq!(ui.post("save", &json!({})).status, 200);
-    assert_eq!(ui.until("still not saved", |_| true)["unsaved"], 1);
+    assert_eq!(ui.until("still not saved", |_| true)["unsaved"], 2);
     // No other device is changed until it is saved, and a search does not lose it.
     let plan = planned(&ui);
     assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
     let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
-    assert_eq!(state["unsaved"], 1);
+    assert_eq!(state["unsaved"], 2);
     // The folder takes files again, but this report has no name there.
     fs::remove_file(&reports).unwrap();
     fs::rename(&away, &reports).unwrap();
@@ -458,7 +469,23 @@ fn what_a_failed_device_has_shown_is_reported() {
     });
     let plan = planned(&ui);
     assert_eq!(confirm(&ui, &plan, &[5, 6]).status, 200);
-    assert_eq!(rows(&ended(&ui)), [(5, "state-failed"), (6, "state-updated")]);
+    let state = ended(&ui);
+    assert_eq!(rows(&state), [(5, "state-failed"), (6, "state-updated")]);
+    assert_eq!((&state["says"], &state["rows"][0]["left"]), (&json!("bad-empty"), &json!("left-none")));
+    // Then the device is not there. What is known of it stays, for page and report.
+    let (next, _server) = kit::fake::serve(Bus(vec![device(6, 1234).0]));
+    assert_eq!(ui.post("open", &json!({ "url": next })).status, 200);
+    ui.until("the other bus", |state| state["adapter"] == *next && state["open"] == true);
+    let plan = planned(&ui);
+    assert_eq!(
+        (&plan["rows"][1]["says"], &plan["rows"][1]["left"]),
+        (&json!("state-empty"), &json!("left-none"))
+    );
+    assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
+    assert_eq!(ended(&ui)["says"], "bad-empty");
+    let is_told =
+        |(name, page): &&(String, String)| name.contains("node-5") && page.contains("kein Programm.");
+    assert_eq!(saved(&folder, "html").iter().filter(is_told).count(), 2);
     let reported = reported.lock().unwrap();
     assert!(!reported.is_empty() && reported.iter().all(|failed| failed.node.get() == 5), "{reported:?}");
     // CiA 302-3: the error 3 in bits 1 to 7 of 1F57h.

@@ -62,6 +62,8 @@ function translate() {
   const named = [name, release].filter((part) => part !== null).join(" ");
   const dated = date === null ? "" : " · " + t("of-date", { date });
   text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${dated}${signature === null ? "" : ` · ${t(signature)}`}`);
+  station.adapters.forEach(({ kind, name, product, state }, index) =>
+    text($("adapter-list").options[index], [t(kind, { name }), product, state in words ? t(state) : state].filter(Boolean).join(" · ")));
   document.title = `${named || file} – coflash`;
   shown = "";
   if (state) show(state);
@@ -72,7 +74,9 @@ function show(next) {
   state = next;
   if (state.plan !== null && state.plan !== plan) {
     plan = state.plan;
-    chosen = new Set(state.rows.filter((row) => row.state === "state-due").map((row) => row.node));
+    // After a reload of the page, what the user has left out of this plan stays so.
+    const due = state.rows.filter((row) => row.state === "state-due").map((row) => row.node);
+    chosen = new Set(kept("chosen")?.plan === plan ? kept("chosen").nodes : due);
   }
   if (state.open && !before?.open) changes = false;
   const from = before?.station;
@@ -85,7 +89,8 @@ function show(next) {
   rows();
   text($("saved-count"), state.saved.length === 1 ? t("saved-one") : t("saved-many", { count: state.saved.length }));
   $("saved").hidden = state.saved.length === 0;
-  $("saved-names").replaceChildren(...state.saved.map((name) => el("li", {}, el("code", {}, `${name}.html, .csv`))));
+  $("sheet").hidden = !state.sheet;
+  $("saved-names").replaceChildren(...state.saved.map((name) => el("li", {}, el("code", {}, name))));
   focus();
 }
 
@@ -115,7 +120,7 @@ function numbers(from) {
 function banner() {
   $("banner").dataset.station = state.station;
   text($("mark"), BANNER[state.station] ?? "●");
-  text($("state"), t(state.station));
+  text($("state"), t(state.says));
   text($("hint"), state.hint === null ? "" : t(state.hint));
   $("number").hidden = state.device_number === "";
   text($("number"), `${t("device-number")}: ${state.device_number}`);
@@ -196,6 +201,7 @@ function row(one) {
       onchange: (event) => {
         if (event.target.checked) chosen.add(one.node);
         else chosen.delete(one.node);
+        keep("chosen", { plan, nodes: [...chosen] });
         buttons();
       },
     })
@@ -214,7 +220,7 @@ function row(one) {
       one.steps.length > 0 ? el("ul", { class: "steps" }, ...one.steps.map(step)) : null,
       one.state === "state-working" ? el("progress", { max: "100", "aria-label": head }) : null,
       ...(one.trouble ? message(one.trouble, one.left) : [])),
-    el("p", { class: "state" }, t(one.state), el("span", { class: "percent" })));
+    el("p", { class: "state" }, t(one.says), el("span", { class: "percent" })));
 }
 
 /** A device that is left alone. */
@@ -304,7 +310,7 @@ function offer() {
   const [list, rate] = [$("adapter-list"), $("rate")];
   const base = (url) => url.split("@")[0];
   const known = station.adapters.map((one) => base(one.url));
-  list.prepend(...station.adapters.map((one) => el("option", { value: base(one.url), "data-rate": one.url.includes("@") }, one.words)));
+  list.prepend(...station.adapters.map((one) => el("option", { value: base(one.url), "data-rate": one.url.includes("@") })));
   const [last, lastRate] = (station.last ?? "").split("@");
   if (known.includes(last)) list.value = last;
   else if (last !== "") [list.value, $("address").value] = ["", station.last];
