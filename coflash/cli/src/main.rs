@@ -181,14 +181,15 @@ fn main() -> ExitCode {
     let failure = result.as_ref().err();
     let error = failure.map(Failure::recorded);
     let kept = record::end(failure.map_or(0, |failure| out.code(failure)), error);
-    let kept = kept.map_err(Failure::system);
-    // The first failure is the result; that the report is not whole is said with it.
-    match (&result, &kept) {
-        (Ok(()), Err(failure)) => out.failure(failure),
-        (Err(_), Err(failure)) => out.warn(failure),
-        _ => {}
-    }
-    match result.and(kept) {
+    let result = match (result, kept) {
+        (Ok(()), kept) => kept.map_err(Failure::system).inspect_err(|failure| out.failure(failure)),
+        // The first failure is the result; that the report is not whole is said with it.
+        (Err(failure), kept) => {
+            kept.unwrap_or_else(|words| out.warn(words));
+            Err(failure)
+        }
+    };
+    match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => out.exit(&failure),
     }
