@@ -13,7 +13,7 @@ type Rule = (&'static str, &'static str);
 
 /// The rooms of `boot-core`. A new room needs a row.
 const BOOT_CORE: &[Rule] = &[
-    ("choices", ""),
+    ("choices", "decision"),
     ("crc", ""),
     ("flash", "crc"),
     ("sequence", "flash"),
@@ -37,7 +37,7 @@ const BOOT_CORE: &[Rule] = &[
     ("programmer", "choices crc flash policy program queue renewal resume sequence source store"),
     (
         "control",
-        "choices flash intake keys policy program programmer refusal renewal resume session source store unseal",
+        "choices decision flash intake keys policy program programmer refusal renewal resume session source store unseal",
     ),
     ("stored_version", "flash programmer"),
     ("bootloader", "choices control decision flash resume store stored_version"),

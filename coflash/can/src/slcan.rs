@@ -18,9 +18,10 @@ use super::ports;
 use super::tcp::{connect, waits, PATIENCE};
 
 mod opening;
+mod queue;
 mod sending;
 
-use self::sending::Sending;
+use self::queue::Sending;
 
 /// How long an adapter may take to answer a command. Some adapters never answer, but work.
 const ANSWER: Duration = Duration::from_millis(300);

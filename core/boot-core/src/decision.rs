@@ -257,7 +257,8 @@ pub struct Start<V = VectorTable> {
     pub vectors: V,
     /// The program starts once without a release.
     pub trial: bool,
-    /// The flash is locked before, until the next reset ([`VerifiedProgram::locks_flash`]).
+    /// The flash is locked before, until the next reset
+    /// ([`locks_flash`](crate::program::VerifiedProgram::locks_flash)).
     pub locks_flash: bool,
 }
 

@@ -18,13 +18,12 @@
 
 use std::time::Duration;
 
+use super::queue::LATE_ANSWER;
 use super::{is_version, Line, Message, Slcan, ANSWER};
 use crate::adapter::{AdapterError, Obstacle};
 use crate::found::shown;
 use crate::ports;
 
-/// The same for an adapter that answers, but too late for the order of the commands.
-pub(super) const LATE_ANSWER: Duration = Duration::from_secs(1);
 /// How long the line must be silent until a late adapter has answered all commands.
 const QUIET: Duration = Duration::from_millis(500);
 /// How long more text of an answer is waited for. Converters from USB hold back text for 16 ms.
