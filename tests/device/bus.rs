@@ -131,8 +131,8 @@ fn foreign(n: usize) -> Frame {
     let data = [byte, !byte, 0x55, byte ^ 0x0F, 0x33, byte, 0, byte];
     let frame = match n % 8 {
         0 => Frame::standard(0x181, &data),
-        // SYNC.
-        1 => Frame::standard(0x080, &[]),
+        // TIME.
+        1 => Frame::standard(0x100, &data[..6]),
         // The SDO channel of the next node.
         2 => Frame::standard(0x602, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
         // 29-bit identifiers that begin like, or are equal to, the identifier of the device's SDO

@@ -412,8 +412,8 @@ fn an_update_can_begin_while_the_journal_makes_room() {
         bench.await_boot_up_of(node, 100);
         bench.events();
         let mut ask = |data: &[u8]| bench.ask(0x600 + u16::from(node), data, 0x580 + u32::from(node));
-        // 2007h/2: COMPACTION.
-        assert_eq!(ask(&[0x40, 0x07, 0x20, 2, 0, 0, 0, 0]).unwrap()[4], 14);
+        // 2007h/11: COMPACTION.
+        assert_eq!(ask(&[0x40, 0x07, 0x20, 11, 0, 0, 0, 0]).unwrap()[4], 14);
         frames.iter().for_each(|frame| drop(ask(frame).expect("an answer")));
         bench.run_ms(800);
         assert_eq!(bench.events().is_empty(), stays, "{image}: {frames:X?}");

@@ -41,10 +41,14 @@ const GPIOD_MODER: u32 = 0x4002_0C00;
 const CAN1: u32 = 0x4000_6400;
 const CAN2: u32 = 0x4000_6800;
 
+/// Network management, request to node 1, layer setting services; in the application SYNC and its RPDO, too.
+const OF_SLAVE: [u32; 3] = [0x000, 0x601, 0x7E5];
+const OF_APPLICATION: [u32; 5] = [0x000, 0x080, 0x201, 0x601, 0x7E5];
+
 /// The settings of the running program: CAN2 on its pins, CAN1 with a clock and in sleep mode, and
-/// only the first filter bank of CAN2. `priorities` are the transmit and receive interrupts'
-/// priorities in the core.
-fn assert_set_up(bench: &mut Bench, priorities: [u32; 2]) {
+/// the first filter banks of CAN2 with these identifiers, four in each. `priorities` are the transmit and
+/// receive interrupts' priorities in the core.
+fn assert_set_up(bench: &mut Bench, identifiers: &[u32], priorities: [u32; 2]) {
     let machine = bench.machine();
     let mut register = |address: u32| machine.register(address).expect("a register that is modelled");
     assert_eq!(register(APB1ENR) >> 25 & 3, 3, "CAN1EN and CAN2EN");
@@ -57,20 +61,21 @@ fn assert_set_up(bench: &mut Bench, priorities: [u32; 2]) {
     assert_eq!(register(CAN1 + 0x14), 0, "CAN1_IER");
     assert_eq!(register(CAN2) & 3, 0, "CAN2_MCR: neither INRQ nor SLEEP");
     assert_eq!(register(CAN1 + 0x200), 0x2A1C_0E00, "FMR: CAN2SB is 14, FINIT is clear");
-    for (offset, value) in [(0x204, 1 << 14), (0x20C, 0), (0x214, 0), (0x21C, 1 << 14)] {
+    let end = 14 + identifiers.len().div_ceil(4) as u32;
+    let banks = (14..end).map(|bank| 1 << bank).sum();
+    for (offset, value) in [(0x204, banks), (0x20C, 0), (0x214, 0), (0x21C, banks)] {
         assert_eq!(register(CAN1 + offset), value, "FM1R, FS1R, FFA1R, FA1R: {offset:#x}");
     }
-    for bank in (0..14).chain(15..28) {
+    for bank in (0..14).chain(end..28) {
         let words = [register(CAN1 + 0x240 + 8 * bank), register(CAN1 + 0x244 + 8 * bank)];
         assert_eq!(words, [0, 0], "bank {bank}");
     }
-    // Network management, request to node 1, layer setting services: STID at 15:5, RTR and IDE
-    // clear.
-    let words = [register(CAN1 + 0x2B0), register(CAN1 + 0x2B4)];
-    let mut listed: Vec<u32> = words.iter().flat_map(|word| [word & 0xFFFF, word >> 16]).collect();
+    // STID at 15:5, RTR and IDE clear.
+    let words = (0x2B0..0x2B0 + 8 * (end - 14)).step_by(4).map(|offset| register(CAN1 + offset));
+    let mut listed: Vec<u32> = words.flat_map(|word| [word & 0xFFFF, word >> 16]).collect();
     listed.sort_unstable();
     listed.dedup();
-    assert_eq!(listed, [0x0000, 0xC020, 0xFCA0]);
+    assert_eq!(listed, identifiers.iter().map(|id| id << 5).collect::<Vec<_>>());
     // NVIC_IPR, a byte for each interrupt. CAN1 and CAN2 have the same handlers: with another
     // priority one of them would interrupt itself.
     let mut priority = |line: u32| register(0xE000_E400 + (line & !3)) >> (8 * (line & 3)) & 0xFF;
@@ -91,7 +96,7 @@ fn an_update_and_the_way_back_through_can2() {
     let mut bench = bench_at(2).switched_on();
     assert!(bench.is_bootloader(1));
     // Tasks of priority 2 and 3 out of 16, in the upper four bits, where 0 is the highest.
-    assert_set_up(&mut bench, [0xE0, 0xD0]);
+    assert_set_up(&mut bench, &OF_SLAVE, [0xE0, 0xD0]);
 
     let options = FlashOptions::default().trial_run(false);
     let report = flash(&mut bench.session(), blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
@@ -100,12 +105,12 @@ fn an_update_and_the_way_back_through_can2() {
     let identification = bench.number(0x1F56, 1);
     assert_eq!(identification, report.program_crc);
     // Priorities 3 and 4.
-    assert_set_up(&mut bench, [0xD0, 0xC0]);
+    assert_set_up(&mut bench, &OF_APPLICATION, [0xD0, 0xC0]);
 
     // Back to the bootloader, and to the program again without a download.
     bench.call_back();
     assert!(bench.is_bootloader(1));
-    assert_set_up(&mut bench, [0xE0, 0xD0]);
+    assert_set_up(&mut bench, &OF_SLAVE, [0xE0, 0xD0]);
     bench.start_program();
     assert_eq!(version(&mut bench), "1.0.0");
 

@@ -140,7 +140,7 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
     out.say("");
     for Outcome { name, result, .. } in outcomes {
         match result {
-            Ok(report) => out.say(format_args!("{name}: done in {:.1} s", report.took.as_secs_f64())),
+            Ok(report) => out.say(format_args!("{name}: {report}")),
             Err(failure) => out.say(format_args!("{name}: {}", failure.to_string().trim_end())),
         }
     }

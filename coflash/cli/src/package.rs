@@ -498,8 +498,7 @@ fn summary(
                 value["state"] = if began.is_some() { "resumed" } else { "had" }.into();
             }
             Ok(Good::Updated(report)) => {
-                let took = report.took.as_secs_f64();
-                out.say(format_args!("{whom}: {}: done in {took:.1} s", program.name));
+                out.say(format_args!("{whom}: {}: {report}", program.name));
                 value["state"] = "updated".into();
                 value["report"] = json!(report);
             }

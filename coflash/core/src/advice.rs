@@ -433,7 +433,7 @@ advice! {
     Unsigned => "[give|choose] the image before imgtool has signed it (of Zephyr zephyr.elf), linked for this \
         bootloader without room for MCUboot's header (CONFIG_BOOTLOADER_MCUBOOT=n, CONFIG_ROM_START_OFFSET=0)",
     /// For a file with a DFU suffix.
-    DfuSuffix => "[give|choose] the linker's output, or take the suffix off (dfu-suffix --delete)",
+    DfuSuffix => "[give|choose] the linker's output, or take the suffix off with dfu-suffix",
     /// For a file with programs for several boards.
     OneBoard => "[give|choose] the HEX file of your board alone",
     /// For a file with a program and other data.

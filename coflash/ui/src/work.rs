@@ -171,10 +171,7 @@ fn update_all(
             match result {
                 Ok(report) => {
                     (update.phase, update.done) = (Phase::Done, update.total);
-                    update.words = match report.renewal {
-                        Some(renewal) => renewal.to_string(),
-                        None => format!("done in {:.1} s", report.took.as_secs_f64()),
-                    };
+                    update.words = report.to_string();
                 }
                 Err(Failed { error, left }) => {
                     update.failed(error, &advice::with_advice(left, left.advice()))

@@ -241,7 +241,7 @@ fn the_bootloader_is_there_as_soon_as_an_open_one() {
 fn updates_take_4_kib_of_the_stack_at_most() {
     const MOST: u32 = 4096;
     let stack = stack::of_image(firmware::BOOTLOADER_SEALED);
-    assert!(stack.size >= 3 * MOST, "the stack has {} bytes", stack.size);
+    assert!(stack.size >= 2 * MOST, "the stack has {} bytes", stack.size);
     let mut bench = board_at(BitRate::K1000);
     stack::fill(bench.machine(), stack);
     for (what, sealer) in kinds_one_by_one() {

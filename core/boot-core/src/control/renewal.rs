@@ -77,7 +77,11 @@ impl<P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'_, P, PROGRAM
         self.programmer.renewing = Some(Renewing { layout, policy, host, record: None, is_occupied: false });
         let last = layout.programs.len() as u8;
         self.note_record(last, load::<C>(&self.parameters, flash, last, &self.rights).0);
-        let record = self.image_record(flash);
+        let mut record = self.image_record(flash);
+        if let Some(record) = record.as_mut().filter(|_| origin == Origin::Confirmed) {
+            // The resident part has read that it is confirmed; it may read differently each time.
+            record.state = State::Confirmed;
+        }
         self.set_record(record);
         let Some(record) = record else { return };
         match (record.state, origin) {

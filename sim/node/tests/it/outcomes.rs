@@ -20,7 +20,7 @@ use crate::bus::{program, Coflash, Folder, Nodes};
 
 /// Where the program is in the file of a flash, its size, and the size of its first part.
 const AT: usize = 0x2_0000;
-const SIZE: usize = 40 * 1024;
+const SIZE: usize = 96 * 1024;
 const OWN: usize = 8 * 1024;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
