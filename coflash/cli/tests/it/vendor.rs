@@ -33,8 +33,7 @@ fn call(folder: &Folder, lie: &str, arguments: &[&str]) -> Done {
 fn command(folder: &Folder, lie: &str, arguments: &[&str]) -> Command {
     let mut command = crate::tool::command();
     command.args(arguments).env("LD_LIBRARY_PATH", folder.as_os_str()).env("FAKE_LIE", lie);
-    // The adapters of two tests have one name: each test has locks of its own.
-    command.env("COFLASH_SEARCH", "peak,kvaser").env("TMPDIR", folder.as_os_str());
+    command.env("COFLASH_SEARCH", "peak,kvaser");
     command
 }
 

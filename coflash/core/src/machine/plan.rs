@@ -327,8 +327,8 @@ fn has(info: &DeviceInfo, entry: &Entry, marks: &Marks) -> Installed {
 /// Whether the device has a newer version.
 fn is_older(info: &DeviceInfo, entry: &Entry, program: &Payload, marks: Option<&Marks>) -> bool {
     match (program.bootloader(), info.bootloader) {
-        // Major in the upper half, minor in the lower.
-        (Some(new), Some(old)) => new.0 < old.version.0,
+        // Major in the upper half, minor in the lower; a sealed one may have none.
+        (Some(new), Some(old)) => new.0 != 0 && new.0 < old.version.0,
         (Some(_), None) => false,
         (None, _) => marks.zip(installed(info, entry)).is_some_and(|(marks, has)| marks.is_older(has)),
     }

@@ -42,7 +42,8 @@ pub fn command() -> Command {
     // same name of an adapter at the same time.
     let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
     for name in ["XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR"] {
-        command.env(name, &nowhere);
+        // A state folder is made at once.
+        command.env(name, nowhere.join(name));
     }
     command.env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG");
     command.env("COFLASH_SEARCH", "none").env("NO_COLOR", "1");
