@@ -139,8 +139,9 @@ impl<I: Controller> Port<I> {
     }
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
-    /// FIFO 0. The other controller's filters stay as they are.
+    /// FIFO 0: 1 to 56 of them, in 14 banks. The other controller's filters stay as they are.
     pub fn accept<const N: usize>(&mut self, identifiers: [u16; N]) {
+        const { assert!(N > 0 && N <= 56, "CAN: 1 to 56 identifiers, in 14 filter banks") };
         let change = |offset: usize, clear: u32, set: u32| {
             // SAFETY: the offset is one of a register above, in the registers of the master. Only
             // the bits of this controller change, which this port owns.

@@ -12,8 +12,8 @@ pub const HELP: &str = "\
 usage: cargo xtask coverage
 
 Counts which lines of the crates without an operating system are reached by tests on the host: each
-crate's own tests, those of the core with sealed images, and the tests of sealed images on the model
-of the flash. What the built firmware does in the emulator is not counted. The result goes to
+crate's own tests, those of the ABI, those of the core with sealed images, random lives, and the tests of
+sealed images on the model of the flash. What the built firmware does in the emulator is not counted. The result goes to
 target/evidence/coverage.json, and the lines that no test reaches to target/coverage/missing.txt.
 
 A line that is reached may still be wrong: `cargo xtask mutants` asks whether a test would notice.
@@ -42,6 +42,8 @@ pub fn run(args: Args) -> Outcome {
     process::run(llvm_cov("--no-report --quiet").args(packages))?;
     let mut core = llvm_cov("--no-report --quiet --package coboot-core");
     process::run(core.env("COBOOT_TAKES_SEALED", "1"))?;
+    process::run(&mut llvm_cov("--no-report --quiet --package coboot-kit --test abi"))?;
+    process::run(&mut llvm_cov("--no-report --quiet --package coboot-attack --test lives"))?;
     let mut sealed = llvm_cov("--no-report --quiet --package coboot-tests --test sealed --");
     process::run(sealed.args(SEALED_TESTS))?;
 

@@ -72,7 +72,8 @@ pub unsafe fn check(flash: &ResidentFlash, place: Region) -> Result<VectorTable,
 
 /// Copies the image in a place to its RAM.
 ///
-/// # Safety [`check`] has found it good. Nothing may use the RAM of the bootloader except its last
+/// # Safety
+/// [`check`] has found it good. Nothing may use the RAM of the bootloader except its last
 /// [`LEAST_STACK`] bytes.
 pub unsafe fn copy(place: Region) {
     // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the

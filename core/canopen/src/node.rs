@@ -144,14 +144,12 @@ impl Node {
                 return Some(Frame::full(CobId::emcy(self.id), emergency));
             }
         }
-        // Without one, nothing is left of this in the program.
-        if let Some(exchange) = objects.exchange() {
-            let frame = if self.state == NmtState::Operational { exchange.poll(now) } else { None };
-            if frame.is_some() {
-                return frame;
-            }
+        // A device that has a PDO to send at any time is alive all the same.
+        if self.heartbeat.take_due(now) {
+            return Some(nmt::state_message(self.id, self.state));
         }
-        self.heartbeat.take_due(now).then(|| nmt::state_message(self.id, self.state))
+        // Without one, nothing is left of this in the program.
+        objects.exchange().filter(|_| self.state == NmtState::Operational)?.poll(now)
     }
 
     fn command(&mut self, command: NmtCommand, objects: &mut impl Objects) {

@@ -213,13 +213,14 @@ impl Pdo {
         (mem::replace(&mut self.progress.fault, fault) != fault).then_some(fault).flatten()
     }
 
-    /// Writes what an RPDO carries. Nobody is told of a value that the process refuses.
+    /// Writes what an RPDO carries. A value that the process refuses is not reported, and the next one is
+    /// written all the same.
     fn deliver(&self, frame: &Frame, process: &mut impl Objects) {
         let mut rest = frame.data();
         for object in self.mapped() {
-            let Some((value, behind)) = rest.split_at_checked((object & 0xFF) as usize / 8) else { return };
+            let Some((value, others)) = rest.split_at_checked((object & 0xFF) as usize / 8) else { return };
             let _ = process.write(address(*object), value);
-            rest = behind;
+            rest = others;
         }
     }
 
@@ -236,10 +237,12 @@ impl Pdo {
     fn synchronise(&mut self, process: &mut impl Objects) {
         let Some(cycle) = self.cycle() else { return };
         let waiting = self.progress.waiting.take();
-        self.progress.syncs += 1;
         if !self.is_transmit() {
             waiting.iter().for_each(|frame| self.deliver(frame, process));
-        } else if self.progress.syncs >= cycle {
+            return;
+        }
+        self.progress.syncs += 1;
+        if self.progress.syncs >= cycle {
             let sent = self.progress.sent.filter(|_| cycle == 0);
             self.progress.waiting = self.compose(process).filter(|frame| Some(*frame) != sent);
             self.progress.syncs = 0;
@@ -423,6 +426,11 @@ impl<const N: usize> Pdos<N> {
             return Some(Ok(()));
         }
         let pdo = self.find(at)?;
+        let (is_cob_id, is_transmit) = ((at.index, at.sub) == (pdo.index, 1), pdo.is_transmit());
+        if is_cob_id {
+            // It says that there are no remote frames, whatever a master writes.
+            value = value & !NO_RTR | if is_transmit { NO_RTR } else { 0 };
+        }
         // The present value again changes nothing.
         if *pdo.parameter(at)?.0 == value {
             return Some(Ok(()));
@@ -430,16 +438,11 @@ impl<const N: usize> Pdos<N> {
         if let Err(code) = pdo.check(at, value, dictionary, process) {
             return Some(Err(code));
         }
-        let is_cob_id = (at.index, at.sub) == (pdo.index, 1);
-        if is_cob_id {
-            // It says that there are no remote frames, whatever a master writes.
-            value = value & !NO_RTR | if pdo.is_transmit() { NO_RTR } else { 0 };
-        }
         *pdo.parameter(at)?.0 = value;
         if (at.index, at.sub) != (pdo.index, 5) {
             pdo.progress = Progress::default();
         }
-        self.identifiers_changed |= is_cob_id;
+        self.identifiers_changed |= is_cob_id && !is_transmit;
         Some(Ok(()))
     }
 

@@ -267,7 +267,9 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         if journal.is_nearly_full() && journal.compact(0) {
             let _ = run(&mut flash, |flash, outcome| journal.next(flash, outcome));
         }
-        let policy = Policy { crc: config.download.crc, ..Policy::plain(config.layout, &PROGRAM_NUMBERS) };
+        // A program that is data does not start.
+        let numbers = if config.download.data == Some(2) { &PROGRAM_NUMBERS[..1] } else { &PROGRAM_NUMBERS };
+        let policy = Policy { crc: config.download.crc, ..Policy::plain(config.layout, numbers) };
         let woken = Woken { cause, request, strap, ..Woken::power_on(node.id_or_none(), node.bit_rate) };
         let choice = choose(&woken, &Images::SOUND, &flash, &journal, &policy);
         if let Some(Store::CrashCount(count)) = choice.store {

@@ -51,18 +51,6 @@ pub struct Program {
     pub(super) cut: Cut,
 }
 
-/// Where a program has a CRC-32 of its own, as build scripts append it: the CRC-32 from there on does not depend
-/// on what is before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum OwnCrc {
-    /// Nowhere.
-    None,
-    /// Before other data: its CRC may also be that of parts of two versions.
-    Inside,
-    /// At its end, before padding at most: its CRC is that of each of its versions.
-    AtEnd,
-}
-
 /// How the dialect `block` cuts a program.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Cut {
@@ -129,15 +117,11 @@ impl Program {
         [self.crc(), other.of_flash(self.start, self.size(), self.image.runs())]
     }
 
-    /// Where it has a CRC-32 of its own.
+    /// Whether it has a CRC-32 of its own, as build scripts append it. The CRC-32 from there on does not depend on
+    /// what is before it: its CRC may be that of each of its versions, and of parts of two.
     #[must_use]
-    pub fn own_crc(&self) -> OwnCrc {
-        let bytes = self.flash_image();
-        match own_crc(&bytes).map(|end| &bytes[end..]) {
-            None => OwnCrc::None,
-            Some(padding) if padding.iter().all(|byte| Some(byte) == padding.first()) => OwnCrc::AtEnd,
-            Some(_) => OwnCrc::Inside,
-        }
+    pub fn has_own_crc(&self) -> bool {
+        own_crc(&self.flash_image()).is_some()
     }
 
     /// The kind of its [CRC](Self::crc).

@@ -411,7 +411,7 @@ impl fmt::Display for Stranger {
 
 /// Why a program is written whose CRC the device reports.
 const CRC_TELLS_NOTHING: &str =
-    "warning: each version of this program has this CRC, because it ends with a CRC-32 of \
+    "warning: each version of this program may have this CRC, because it has a CRC-32 of \
      its own: nobody knows whether the device has it, so it is written";
 
 impl fmt::Display for Plan {

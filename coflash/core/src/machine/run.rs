@@ -121,6 +121,7 @@ pub fn run(
         failed.extend(bad.map(|(node, _)| *node));
         let updated = ended.iter().filter_map(|(node, result)| match result {
             Ok(Good::Updated(report)) if report.renewal.is_none() => Some((*node, report.left())),
+            Err(Bad::Failed(failed)) => Some((*node, failed.left.state)),
             _ => None,
         });
         known.extend(updated);

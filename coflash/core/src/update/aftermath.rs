@@ -66,7 +66,10 @@ fn is_not_admitted(error: &Error) -> bool {
 /// The state of a device, from the course of the update, its error and the device's answers.
 fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &Error) -> DeviceState {
     let wrote = update.known.wrote && !is_not_admitted(error);
+    let has_new = answers.crc.is_some_and(|crc| crcs.contains(&crc));
     match update.known.state {
+        // An earlier attempt has written it.
+        DeviceState::Begun if !answers.running.is_bootloader() && has_new => DeviceState::Written,
         // The application was called and has stayed, or is back.
         DeviceState::Called | DeviceState::Begun if !answers.running.is_bootloader() => {
             DeviceState::Untouched
@@ -76,6 +79,10 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
         DeviceState::Erased if !answers.empty() => match answers.crc {
             // A device that erases with the first good block has received none.
             reported @ Some(_) if !wrote && reported == update.known.before => update.known.state_before,
+            // The new one runs: the device has started it by itself.
+            _ if wrote && has_new && answers.crc != update.known.before && !answers.running.is_bootloader() => {
+                DeviceState::Written
+            }
             // It runs, so it is whole.
             _ if answers.control == Some(ProgramState::Running as u32)
                 && !answers.running.is_bootloader() =>

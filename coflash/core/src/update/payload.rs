@@ -13,7 +13,6 @@ use crate::device::error::{flash_error_number, IdentityPart};
 use crate::device::info::{Identity, ProgramInfo};
 use crate::device::Form;
 use crate::file::checksum::is_of_self_checked;
-use crate::file::program::OwnCrc;
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Format};
 use crate::file::sealed::{Refusal, SealedFile};
@@ -147,7 +146,7 @@ impl Payload {
     #[must_use]
     pub fn marks(&self) -> Marks {
         let tells_nothing = match self {
-            Self::Program(program) => program.own_crc() == OwnCrc::AtEnd,
+            Self::Program(program) => program.has_own_crc(),
             Self::Sealed(file) => is_of_self_checked(file.head().crc()),
             Self::Bootloader(_) => false,
         };

@@ -144,7 +144,7 @@ fn procedure(
             let running = procedure.start(session, update.original, options.program)?;
             watch::watch(session, starts, time)?;
             update.report(Phase::Started(running).into());
-            watched = Some(time);
+            watched = Some((starts, time));
             Some(running)
         }
         None => None,
@@ -153,7 +153,7 @@ fn procedure(
     if options.verify && renewal.is_none() {
         let crc = compare_crc(session, options.program, file.crcs());
         let crc = match watched {
-            Some(_) => crc.map_err(|error| watch::fell_silent(session, began, error))?,
+            Some((starts, _)) => crc.map_err(|error| watch::fell_silent(session, starts, error))?,
             None => crc?,
         };
         update.report(Phase::VerifiedAgain { crc }.into());
@@ -169,7 +169,7 @@ fn procedure(
         transfer,
         transfers,
         running,
-        watched,
+        watched: watched.map(|(_, time)| time),
         released,
         dialect,
         renewal: renewal.map(|renewal| Renewal { took, ..renewal }),

@@ -172,11 +172,11 @@ impl Station {
             }
             Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
         }
-        own.known.recall(&mut rows);
         let due = rows.iter().filter(|row| matches!(row.state, RowState::Due | RowState::Older)).count();
         if matches!(own.stage, Stage::Working(_)) {
             rows.iter_mut().for_each(|row| row.advance(&shown.updates));
         }
+        own.known.recall(&mut rows);
         let is_busy = shown.task.is_some();
         let is_good = |row: &Row| !matches!(row.state, RowState::Failed);
         let ended = headline(&rows);

@@ -65,6 +65,7 @@ const OUTCOMES: [(&str, &str, Fate, &str, &str); 16] = [
     ("1-0d", "2-0d", Fate::Well, "updated", "updated"),
     ("1-1z", "2-2z", Fate::Well, "updated", "updated"),
     ("1-1z", "2-1z", Fate::Well, "updated", "updated"),
+    ("1-ni", "2-ni", Fate::Well, "updated", "updated"),
     ("1-0p", "2-1x", Fate::Well, "untouched", "untouched"),
     ("", "1-0p", Fate::Dies, "erased", "erased"),
     ("1-0p", "2-0p", Fate::Dies, "erased", "erased"),

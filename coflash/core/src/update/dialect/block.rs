@@ -17,7 +17,7 @@ use crate::file::block_file::{Block as FileBlock, BlockFile, FRAMING};
 use crate::file::checksum::Checksum;
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
-use crate::file::program::{OwnCrc, Program};
+use crate::file::program::Program;
 use crate::file::sealed::SealedFile;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, RepeatReason, Warning};
@@ -178,7 +178,7 @@ impl PartialDownload {
 /// Whether a part of another version and the rest of this one may have the CRC of this one, which is all that the
 /// device compares at the end. A date in block 0, whose CRC the device has kept, tells the versions apart.
 fn is_mixed_unseen(program: &Program) -> bool {
-    program.own_crc() != OwnCrc::None && program.release().is_none_or(|release| release.date == 0)
+    program.has_own_crc() && program.release().is_none_or(|release| release.date == 0)
 }
 
 /// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off, unless
