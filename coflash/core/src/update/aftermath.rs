@@ -80,7 +80,11 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
             // A device that erases with the first good block has received none.
             reported @ Some(_) if !wrote && reported == update.known.before => update.known.state_before,
             // The new one runs: the device has started it by itself.
-            _ if wrote && has_new && answers.crc != update.known.before && !answers.running.is_bootloader() => {
+            _ if wrote
+                && has_new
+                && answers.crc != update.known.before
+                && !answers.running.is_bootloader() =>
+            {
                 DeviceState::Written
             }
             // It runs, so it is whole.

@@ -51,10 +51,10 @@ enum Fate {
 /// The outcomes: what the devices have before, what they get, what happens, and what is to be said by `flash` and by
 /// a way with a plan.
 ///
-/// A file is its byte, its version (0 for a raw file, `n` for none in block 0) and a letter: `p`lain, or with its CRC-32 at the end as `z`lib gives
-/// it, `d` as the suffix of DFU has it; `i` has it at the end of its first part alone, and the rest is the same in each;
+/// A file is its byte, its version (0 for a raw file, `n` for none in block 0) and a letter: `p`lain, or with its
+/// CRC-32 at the end as `z`lib gives it, `d` as the suffix of DFU has it; `i` has it at the end of its first part alone, and the rest is the same in each;
 /// `x` is for another product.
-const OUTCOMES: [(&str, &str, Fate, &str, &str); 16] = [
+const OUTCOMES: [(&str, &str, Fate, &str, &str); 17] = [
     ("", "1-0p", Fate::Well, "updated", "updated"),
     ("1-0p", "2-0p", Fate::Well, "updated", "updated"),
     ("1-1p", "2-2p", Fate::Well, "updated", "updated"),
