@@ -124,6 +124,10 @@ struct Poll {
     /// LR, SP, PC and xPSR.
     core: [u32; 4],
     general: [u32; 13],
+    /// A checksum of the RAM, once the registers were as before.
+    ram: Option<u64>,
+    /// How often only the RAM was another one: such a loop counts there.
+    counts: u8,
 }
 
 /// The data that the hooks leave for the caller.

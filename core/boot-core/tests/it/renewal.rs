@@ -118,6 +118,11 @@ impl Board {
     /// The bootloader has come up, and has done nothing yet.
     fn wake(&mut self) -> Node<'_> {
         let (_, origin, trial_end) = self.loads();
+        self.wake_as(origin, trial_end)
+    }
+
+    /// The same, as this image.
+    fn wake_as(&mut self, origin: Origin, trial_end: TrialEnd) -> Node<'_> {
         self.request = None;
         let report = BootReport { renewal: word(origin, trial_end), ..BootReport::NONE };
         let journal = Journal::open(&self.flash, LAYOUT.parameters);
@@ -585,6 +590,18 @@ fn a_program_that_ends_before_staging_leaves_it_alone() {
         let mut node = board.start();
         assert_eq!((node.progress().state, node.has_staged(&NEW)), (State::Installed, true), "{size:#x}");
     }
+}
+
+/// After a power cut the record reads differently each time: confirmed in the resident part, staged in the image.
+#[test]
+fn an_image_that_was_loaded_as_confirmed_is_installed() {
+    let mut board = Board::new(&OLD);
+    board.start().stage(&NEW);
+    board.off();
+    let mut node = board.wake_as(Origin::Confirmed, TrialEnd::None);
+    node.settle();
+    assert_eq!((node.progress().state, node.word(0x1F57)), (State::Installed, 0));
+    assert_eq!(board.flash.cells(HOME)[..NEW.len()], **NEW);
 }
 
 #[test]

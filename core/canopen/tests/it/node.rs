@@ -2,7 +2,8 @@
 
 use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
 use canopen::node::{Config, NmtPolicy, Node};
-use canopen::{CobId, Frame, NodeId};
+use canopen::od::{Address, Entry, Exchange, Objects};
+use canopen::{AbortCode, CobId, Frame, Instant, NodeId};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 use kit::bus::{at, node, request, response, Device, Event};
 
@@ -36,6 +37,55 @@ fn state(byte: u8) -> Frame {
 
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10];
+
+/// A device whose process data are others at each moment.
+#[derive(Default)]
+struct Eager(Device);
+
+impl Objects for Eager {
+    fn entries(&self) -> &'static [Entry] {
+        self.0.entries()
+    }
+
+    fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        self.0.read(at, buf)
+    }
+
+    fn exchange(&mut self) -> Option<&mut dyn Exchange> {
+        Some(self)
+    }
+}
+
+impl Exchange for Eager {
+    fn state_changed(&mut self, _: NmtState) {}
+
+    fn handle(&mut self, _: &Frame) {}
+
+    fn poll(&mut self, _: Instant) -> Option<Frame> {
+        Some(Frame::of(CobId::new(0x185).unwrap(), &[1]))
+    }
+
+    fn identifier(&self, _: usize) -> Option<CobId> {
+        None
+    }
+
+    fn identifiers_changed(&mut self) -> bool {
+        false
+    }
+}
+
+#[test]
+fn a_node_with_a_pdo_at_each_moment_sends_its_heartbeat() {
+    let mut device = Eager::default();
+    let config = Config { heartbeat_ms: 100, nmt: NmtPolicy::Follow, ..Config::default() };
+    let mut node = Node::new(node(), config);
+    assert_eq!(node.poll(at(0), &mut device), Some(state(0x00)));
+    node.handle(&nmt(&[0x01, 0]), at(0), &mut device);
+    assert_eq!(
+        [99, 100, 100].map(|now| node.poll(at(now), &mut device) == Some(state(0x05))),
+        [false, true, false]
+    );
+}
 
 #[test]
 fn says_its_boot_up_once_and_then_its_heartbeat() {

@@ -164,6 +164,8 @@ fn an_event_is_a_new_value_or_the_end_of_the_event_timer() {
         bench.now = now;
         assert_eq!(bench.sent(), expected, "{now} ms");
     }
+    // Without bit 30 it is the same COB-ID.
+    assert_eq!((bench.write(0x1800, 1, 0x185), bench.sent()), (0, None));
     assert_eq!(bench.write(0x1800, 5, 50), 0);
     assert_eq!((bench.sent(), bench.sent()), (tpdo(1), None));
     for _ in 0..3 {

@@ -59,6 +59,16 @@ fn a_loop_that_only_waits_for_the_flash_costs_the_host_nothing() {
     assert!(instructions < 10_000, "{instructions}");
 }
 
+/// A round has 7 instructions, which take 20 cycles of 16 MHz at most.
+#[test]
+fn a_loop_that_counts_in_the_ram_gets_each_of_its_rounds() {
+    let mut machine = machine_in_ram(&programs::COUNTS_THE_POLLS, 0, Options::default());
+    machine.write_ram(OUT, &[0; 8]).unwrap();
+    machine.run_until(ms(251));
+    let [done, rounds] = words(&machine, 2)[..] else { panic!("two words") };
+    assert!(done == 1 && rounds > 250 * 16_000 / 20, "{rounds}");
+}
+
 #[test]
 fn a_load_from_busy_flash_stalls_code_in_ram() {
     let mut machine = machine_in_ram(&programs::FLASH_FROM_RAM, 1, Options::default());

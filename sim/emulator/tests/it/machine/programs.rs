@@ -37,6 +37,7 @@ macro_rules! programs {
 programs! {
     STORES_AND_SLEEPS,
     POLLS_THE_FLASH,
+    COUNTS_THE_POLLS,
     SYSTICK,
     NESTING,
     MASKS,
