@@ -95,7 +95,10 @@ pub(super) fn note_interrupted(rows: &mut [Row], folder: &Folder) {
     for row in rows {
         // Without its serial number it may be any device.
         let latest = row.identity[3].and_then(|_| folder.latest(&of_device(row), Report::ENDINGS[1]));
-        let is_in = |text: &str, step: &Step| text.contains(&step.program) && text.contains(&step.to);
+        let cell = |text: &str| format!(",{},", csv_cell(text));
+        let is_of_step =
+            |line: &str, step: &Step| line.contains(&cell(&step.program)) && line.contains(&cell(&step.to));
+        let is_in = |text: &str, step: &Step| text.lines().any(|line| is_of_step(line, step));
         let is_of = |text: &str| row.steps.iter().all(|step| is_in(text, step));
         let begun = latest.filter(|(name, text)| name.contains(BEGUN) && is_of(text));
         row.interrupted = begun.map(|(name, _)| name);

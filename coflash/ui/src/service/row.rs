@@ -1,6 +1,6 @@
 //! The devices of a plan or an update, as the page and the reports have them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use canopen::NodeId;
 use coflash_core::machine::{Foreign, Good, Outcome, Plan, Stranger, Todo};
@@ -240,27 +240,41 @@ pub(super) fn headline(rows: &[Row]) -> (&'static str, &'static str) {
     }
 }
 
-/// What is known of devices whose last update has failed, by node-ID: 1018h/4, and the key of what they have.
+/// What is known of devices of a machine whose last update has failed.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Known(BTreeMap<u8, (Option<u32>, &'static str)>);
+pub(super) struct Known {
+    /// By node-ID: 1018h/4, and the key of what the device has.
+    devices: BTreeMap<u8, (Option<u32>, &'static str)>,
+    /// The serial numbers of the machine.
+    machine: BTreeSet<u32>,
+}
 
 impl Known {
     /// Enters it into the devices that were not asked since then, remembers what is known of the others, and has each
     /// row say so.
     pub(super) fn recall(&mut self, rows: &mut [Row]) {
+        let serials: BTreeSet<u32> = rows.iter().filter_map(|row| row.identity[3]).collect();
+        // Of another machine nothing is known.
+        if !serials.is_empty() && serials.is_disjoint(&self.machine) {
+            *self = Self::default();
+        }
         for row in rows {
             let (node, serial) = (row.node.unwrap_or(0), row.identity[3]);
             // What a device says that has a program is right.
             let has_program = row.steps.iter().any(|step| step.from.is_some());
             match (row.state, row.left) {
                 (RowState::Failed, None | Some("left-untouched")) => {
-                    let known = self.0.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
+                    let known =
+                        self.devices.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
                     row.left = known.map(|(_, left)| *left).or(row.left);
                 }
-                (RowState::Failed, Some(left)) => drop(self.0.insert(node, (serial, left))),
+                (RowState::Failed, Some(left)) => {
+                    self.devices.insert(node, (serial, left));
+                    self.machine.extend(&serials);
+                }
                 (RowState::Due, _) if !has_program => {}
                 (RowState::Updated | RowState::Has | RowState::Due | RowState::Older, _) => {
-                    self.0.remove(&node);
+                    self.devices.remove(&node);
                 }
                 _ => {}
             }

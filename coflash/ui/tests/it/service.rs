@@ -483,6 +483,13 @@ fn what_a_failed_device_has_shown_is_reported() {
     );
     assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
     assert_eq!(ended(&ui)["says"], "bad-empty");
+    // Of the next machine nothing is known.
+    let (other, serial) = device(6, 1234);
+    *serial.lock().unwrap() = 2006;
+    let (next, _server) = kit::fake::serve(Bus(vec![other]));
+    assert_eq!(ui.post("open", &json!({ "url": next })).status, 200);
+    ui.until("the bus of the next machine", |state| state["adapter"] == *next && state["open"] == true);
+    assert_ne!(planned(&ui)["rows"][1]["says"], "state-empty");
     let is_told =
         |(name, page): &&(String, String)| name.contains("node-5") && page.contains("kein Programm.");
     assert_eq!(saved(&folder, "html").iter().filter(is_told).count(), 2);

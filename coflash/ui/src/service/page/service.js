@@ -312,7 +312,8 @@ function offer() {
   const known = station.adapters.map((one) => base(one.url));
   list.prepend(...station.adapters.map((one) => el("option", { value: base(one.url), "data-rate": one.url.includes("@") })));
   const [last, lastRate] = (station.last ?? "").split("@");
-  if (known.includes(last)) list.value = last;
+  // The list has no port with a speed of its own.
+  if (known.includes(last) && !station.last.includes("?")) list.value = last;
   else if (last !== "") [list.value, $("address").value] = ["", station.last];
   else list.selectedIndex = 0;
   if ([...rate.options].some((option) => option.value === lastRate)) rate.value = lastRate;
