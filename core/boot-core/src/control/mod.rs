@@ -250,10 +250,15 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
     /// 2007h/12: the programs that are released for autostart, number 1 in bit 0.
     pub(crate) fn released(&self) -> u32 {
         let of = |(place, state): (usize, &Program)| match state.record {
-            Some(record) if record.signed && self.policy.data != Some(place as u8 + 1) => 1 << place,
+            Some(record) if record.signed => 1 << place,
             _ => 0,
         };
-        self.programs.iter().take(32).enumerate().map(of).sum()
+        let released: u32 = self.programs.iter().take(32).enumerate().map(of).sum();
+        // Data are stored as a program that is released.
+        match self.policy.data {
+            Some(number) => released & !(1_u32.wrapping_shl(u32::from(number).wrapping_sub(1))),
+            None => released,
+        }
     }
 
     /// 1F56h: the CRC of the program, 0 if there is none.
