@@ -108,3 +108,41 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
         state => state,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::running::Known;
+    use super::*;
+    use crate::update::options::FlashOptions;
+
+    /// A program that runs is the new one if the device says so and had another CRC before; otherwise the old one.
+    #[test]
+    fn a_program_that_runs_is_the_one_with_its_crc() {
+        const NEW: u32 = 2;
+        let erased = |before| Known {
+            state: DeviceState::Erased,
+            touched: true,
+            state_before: DeviceState::Called,
+            before: Some(before),
+            postponed: false,
+            wrote: true,
+        };
+        for (mut known, crc, left) in [
+            (erased(1), NEW, DeviceState::Written),
+            (erased(1), 1, DeviceState::Untouched),
+            (erased(NEW), NEW, DeviceState::Untouched),
+            (Known::begun(), NEW, DeviceState::Written),
+            (Known::begun(), 1, DeviceState::Untouched),
+        ] {
+            let answers = Answers {
+                running: DeviceType(0),
+                control: Some(ProgramState::Running as u32),
+                crc: Some(crc),
+            };
+            let nobody = &mut |_| {};
+            let node = canopen::NodeId::MAX;
+            let update = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
+            assert_eq!(judge(&update, &answers, [NEW, 0xBEEF], &Error::Cancelled), left, "{crc}");
+        }
+    }
+}

@@ -164,6 +164,7 @@ fn procedure(
     Ok(Report {
         program_size,
         program_crc,
+        device_crc: update.verified,
         repeats,
         took,
         transfer,

@@ -17,9 +17,12 @@ pub struct Report {
     /// Size of the program in bytes, from the start of its region.
     #[serde(rename = "size")]
     pub program_size: u32,
-    /// CRC of the program in the device: the value of 1F56h.
+    /// The CRC-32 of the program.
     #[serde(rename = "crc")]
     pub program_crc: u32,
+    /// The CRC that the device has reported of it (1F56h), which may be a CRC-16; `None` if it was not asked.
+    #[serde(skip)]
+    pub device_crc: Option<u32>,
     /// Blocks that had to be sent again.
     #[serde(rename = "blocks_repeated")]
     pub repeats: u32,

@@ -88,6 +88,8 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) called: Option<u8>,
     /// What had not gone through the adapter when a program was started, to be watched.
     pub(super) losses: Option<Losses>,
+    /// The value of 1F56h, once it was read and is that of the file.
+    pub(super) verified: Option<u32>,
     /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
     /// The devices with which it gets its data together, as reported.
@@ -114,6 +116,7 @@ impl<'t> RunningUpdate<'t> {
             known,
             called: None,
             losses: None,
+            verified: None,
             mastership: None,
             together: 0,
             disturbed: false,
@@ -179,6 +182,9 @@ impl<'t> RunningUpdate<'t> {
         match &event {
             Event::Phase(Phase::Erased { took }) => {
                 self.known.postponed = *took < PUT_OFF && !self.known.wrote
+            }
+            Event::Phase(Phase::Verified { crc } | Phase::VerifiedAgain { crc }) => {
+                self.verified = Some(*crc)
             }
             Event::Note(Note::Together { devices }) if self.together == *devices => return,
             Event::Note(Note::Together { devices }) => self.together = *devices,

@@ -208,7 +208,7 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
         let state = match &outcome.result {
             Ok(Good::Had) => RowState::Has,
             Ok(Good::Updated(report)) => {
-                let crc = Some(report.program_crc).filter(|_| report.renewal.is_none());
+                let crc = report.device_crc.filter(|_| report.renewal.is_none());
                 row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|it| it.crc = crc);
                 RowState::Updated
             }

@@ -72,9 +72,12 @@ pub(super) fn html(report: &Report) -> String {
         ("=troubles", rows.iter().filter_map(|row| text.trouble(row)).collect()),
         ("=programs", service.package.programs().map(program).collect()),
         ("=file", text.of(file)),
-        ("=good", text.good(rows, of, |state, _, _| state != RowState::LeftOut)),
-        ("=tried", text.good(rows, of, |state, entry, _| is_new(state) && entry.trial_run)),
-        ("=sealed", text.good(rows, of, |state, _, it| is_new(state) && matches!(it, Payload::Sealed(_)))),
+        ("=good", text.good(rows, of, |step, _, _| has_shown_crc(step))),
+        ("=tried", text.good(rows, of, |step, entry, _| is_new(step.state) && entry.trial_run)),
+        (
+            "=sealed",
+            text.good(rows, of, |step, _, it| is_new(step.state) && matches!(it, Payload::Sealed(_))),
+        ),
     ]
     .into();
     filled(PAGE, |name| values.get(name).cloned().unwrap_or_else(|| text.of(name)))
@@ -90,6 +93,15 @@ fn program((entry, program): (&Entry, &Payload)) -> String {
     let version = version(program).unwrap_or_else(|| "–".to_owned());
     let sum = format!("<code>{}</code>", escaped(&entry.sha256));
     line(&[escaped(&entry.name), escaped(&version), program.size().to_string(), hex(program.crc()), sum])
+}
+
+/// Whether the CRC of a program counts: not if it was left out, or written in a device that was not asked.
+fn has_shown_crc(step: &Step) -> bool {
+    match step.state {
+        RowState::LeftOut => false,
+        RowState::Updated => step.crc.is_some(),
+        _ => true,
+    }
 }
 
 /// A line of a table.
@@ -117,10 +129,10 @@ impl Text {
     }
 
     /// How many of the programs that are asked for are in their devices.
-    fn good(self, rows: &[Row], of: &Of, asks: fn(RowState, &Entry, &Payload) -> bool) -> String {
+    fn good(self, rows: &[Row], of: &Of, asks: fn(&Step, &Entry, &Payload) -> bool) -> String {
         let is_asked = |step: &&Step| {
             let program = of.service.package.programs().nth(step.entry);
-            program.is_some_and(|(entry, program)| asks(step.state, entry, program))
+            program.is_some_and(|(entry, program)| asks(step, entry, program))
         };
         let steps: Vec<&Step> = rows.iter().flat_map(|row| &row.steps).filter(is_asked).collect();
         let good =

@@ -86,7 +86,7 @@ fn the_whole_procedure_from_a_running_application() {
         (report.program_size, report.repeats, report.running.map(|running| running.0)),
         (4001, 0, Some(APPLICATION))
     );
-    assert_eq!(report.program_crc, file().crc());
+    assert_eq!((report.program_crc, report.device_crc), (file().crc(), Some(file().crc())));
     let words: Vec<String> = events
         .iter()
         .filter(|event| !matches!(event, Event::Progress { .. }))
@@ -341,6 +341,9 @@ fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
         assert!(fake.blocks.concat() == wanted);
         let repeats = u32::from(file != wanted);
         assert_eq!((report.repeats, fake.count("command 03")), (repeats, 1));
+        // 1F56h has the device's own CRC, and not that of the file.
+        assert_eq!(report.device_crc.map(|crc| crc <= 0xFFFF), Some(wanted == other));
+        assert_eq!(report.device_crc == Some(report.program_crc), repeats == 0);
         // A damaged block 0 looks the same: the other CRC is then in vain.
         let mut fake = bootloader(|fake| fake.on_block = script(0, 1, Outcome::Status(0x06)));
         assert_eq!(sent(&mut fake, FlashOptions::default()).unwrap().repeats, 2 - repeats);
