@@ -1,7 +1,7 @@
 //! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
 
 use canopen::AbortCode;
-use kit::bench::CLEAR;
+use kit::bench::{CLEAR, CLR_SIGNATURE};
 use kit::model::{until_power_cut, Cut};
 use kit::rig::{raw, Rig, AT_ONCE_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::Region;
@@ -62,6 +62,14 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     rig.settle();
     rig.reset();
     assert_eq!(clear(&mut rig, 1), sectors(5000));
+    // Another command between them is no download.
+    rig.install(1, &raw(&STANDARD_1, 1, 100));
+    erased(&rig, 1);
+    for command in [CLEAR, CLR_SIGNATURE, CLEAR] {
+        rig.command(1, command).unwrap();
+        rig.settle();
+    }
+    assert_eq!(erased(&rig, 1), sectors(100));
     // Sectors that were erased for the program, but not written, are still erased.
     let mut holey = raw(&STANDARD_1, 1, 9000);
     holey[1000..].fill(0xFF);

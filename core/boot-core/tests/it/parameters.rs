@@ -595,6 +595,16 @@ fn after_two_updates_a_day_for_ten_years_a_start_takes_as_long_as_at_first() {
     }
 }
 
+/// A start keeps 16 slots free for what an application stores.
+#[test]
+fn a_region_is_nearly_full_with_fewer_than_16_free_slots() {
+    let slots = JOURNAL[0].size / 28;
+    for (free, is_nearly_full) in [(17, false), (16, false), (15, true), (14, true)] {
+        let flash = used_slots(slots - free);
+        assert_eq!(Journal::open(&flash, JOURNAL).is_nearly_full(), is_nearly_full, "{free} free slots");
+    }
+}
+
 /// From 64 used slots on when a second has passed without work on the flash, from 256 on at once; and once. A reset
 /// waits meanwhile, and a command does not.
 #[test]

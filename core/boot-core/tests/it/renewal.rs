@@ -827,6 +827,23 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
     assert_eq!(node.progress().state, State::Installed);
 }
 
+/// While a block is written, a CLEAR begins the own download again, and other commands are refused.
+#[test]
+fn a_clear_alone_breaks_off_the_own_download() {
+    let mut board = Board::new(&OLD);
+    let mut node = board.start();
+    assert_eq!(node.command(N, CLEAR), 0);
+    let mut blocks = block_file_at(&NEW, HOME.base, 200).into_iter();
+    node.send(N, &blocks.next().unwrap()).unwrap();
+    node.push(N, &blocks.next().unwrap()).unwrap();
+    for command in [CONFIRM, WITHDRAW, START] {
+        assert_eq!(node.try_command(N, command), Err(AbortCode::DEVICE_STATE), "{command:X}h");
+    }
+    assert_eq!(node.try_command(N, CLEAR), Ok(()));
+    node.settle();
+    node.stage(&NEW);
+}
+
 /// A master that does not know this number, and writes to every sub-index.
 #[test]
 fn commands_by_themselves_change_nothing() {
