@@ -82,29 +82,6 @@ fn a_node_whose_journal_is_nearly_full_starts_its_program() {
     nodes.await_line("serial 1, node 5: would start program 1");
 }
 
-/// The erase of a program on flash with realistic times.
-#[test]
-fn erasing_waits_for_the_flash() {
-    let (folder, _nodes, coflash) = start("erase", &["--node", "5", "--board", "stm32f407g-disc1-two"]);
-    let two = ["-I", "binary", "--board", "stm32f407g-disc1-two", "-N", "5"];
-    coflash.done(&[&["flash", "program.bin", "--no-start"][..], &two].concat());
-    let erased = coflash.json(&["erase", "-N", "5"]);
-    assert_eq!(programmed(&folder), 0);
-    // 200 KiB lie in sectors 5 and 6: two times a second, by the datasheet.
-    assert!(erased["seconds"].as_f64().unwrap() >= 2.0, "{erased}");
-}
-
-/// If a device refuses a read, the message contains the abort code (06010001h: the object is
-/// write-only) in words.
-#[test]
-fn the_program_cannot_be_read_back() {
-    let (folder, _nodes, coflash) = start("read", &["--node", "5"]);
-    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "-o", "back.bin"]);
-    assert_eq!(refused.exit, 6);
-    assert!(refused.err.contains("node 5 refuses reading 1F50h/1: abort 06010001h"), "{}", refused.err);
-    assert!(!folder.path("back.bin").exists());
-}
-
 #[test]
 fn an_update_in_all_its_ways() {
     let (folder, _nodes, coflash) = start("ways", &["--node", "5", "--flash", "instant", "--stand-in"]);
@@ -162,26 +139,6 @@ fn a_job_file_serves_its_devices_and_reports() {
     }
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "5"])["number"], 1);
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "6"])["number"], 0);
-}
-
-#[test]
-fn scan_monitor_and_shell_hear_the_nodes() {
-    let (_folder, _nodes, coflash) =
-        start("hear", &["--node", "5", "--count", "2", "--heartbeat", "50", "--flash", "instant"]);
-    let scan = coflash.json(&["scan", "--listen-only", "--listen", "500"]);
-    let found: Vec<&Value> = scan["nodes"].as_array().unwrap().iter().map(|node| &node["node"]).collect();
-    assert_eq!(found, [5, 6]);
-    let said = coflash.done(&["monitor", "--count", "3", "-N", "6"]);
-    assert_eq!(said.lines().count(), 3, "{said}");
-    assert!(said.lines().all(|line| line.contains("node 6: heartbeat, pre-operational")), "{said}");
-    let said = coflash.typed(&["more", "shell"], "info -N 5\nread 1018/4 -N 6\nnonsense\nreset -N 5\n");
-    assert_eq!(said.exit, 2, "typed by a script, the first that fails is the last: {}", said.err);
-    assert!(said.out.contains("serial number     00000001h"), "{}{}", said.out, said.err);
-    assert!(said.out.contains("node 6, 1018h/4: 2 (00000002h)"), "{}{}", said.out, said.err);
-    // Traffic of the bus, recorded and shown again.
-    coflash.done(&["read", "1018/4", "-N", "6", "--trace", "bus.log"]);
-    let said = coflash.done(&["monitor", "--replay", "bus.log"]);
-    assert!(said.contains("to node 6: read 1018h/4 (serial number)"), "{said}");
 }
 
 /// Ctrl-C at any point of the update; the same command again, at once, completes it.
@@ -304,79 +261,4 @@ fn frames_of_others_are_passed_over() {
     drop(stop);
     assert!(noise.join().unwrap() > 10);
     assert_eq!(folder.read("1.flash")[0x2_0000..0x5_2000], program(0xA5));
-}
-
-/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash names
-/// the dialect.
-#[test]
-fn dialects_are_found_out_or_named() {
-    let folder = folder("dialects");
-    let stand_in = ["--node", "5", "--flash", "instant", "--stand-in"];
-    {
-        let nodes = Nodes::start(&folder, &stand_in);
-        let coflash = Coflash::new(&folder, &nodes);
-        assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "block");
-        for dialect in ["raw", "hex"] {
-            let done = coflash.json(&[FLASH, &["-N", "5", "--dialect", dialect, "--verify"]].concat());
-            assert_eq!(done["dialect"], dialect);
-            assert_eq!(done["running"], 0, "{done}");
-        }
-        assert_eq!(folder.read("1.flash")[0x2_0000..][..200 * 1024], program(0xA5));
-    }
-    let nodes =
-        Nodes::start(&folder, &[&stand_in[..], &["--serial", "2", "--profile", "esacademy"]].concat());
-    let coflash = Coflash::new(&folder, &nodes);
-    assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "esacademy");
-    let refused = coflash.run(&[FLASH, &["-N", "5", "--unlock", "OPEN"]].concat());
-    assert_eq!(refused.exit, 6, "{}", refused.err);
-    assert!(
-        refused.err.contains("password") && refused.err.contains("it was not changed"),
-        "{}",
-        refused.err
-    );
-    // It accepts none for half a second.
-    std::thread::sleep(Duration::from_millis(700));
-    let done = coflash.json(&[FLASH, &["-N", "5", "--unlock", "INIT"]].concat());
-    assert_eq!((&done["dialect"], &done["running"]), (&json!("esacademy"), &json!(0)));
-    // The password would erase the program that is to be read.
-    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "--dialect", "esacademy", "--unlock", "INIT"]);
-    assert_eq!(refused.exit, 2, "{}", refused.err);
-}
-
-/// The program with the label that a lift needs, for vendor-ID and product code 0. Its check word
-/// is the fold of the seven words before, implemented again here.
-fn labelled() -> Vec<u8> {
-    let mut words = [0_u32; 7];
-    words[0] = u32::from_le_bytes(*b"CBL1");
-    let fold = words
-        .iter()
-        .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1));
-    let mut image = program(0xA5);
-    for (place, word) in image[0x1E0..0x200].chunks_mut(4).zip(words.into_iter().chain([!fold])) {
-        place.copy_from_slice(&word.to_le_bytes());
-    }
-    image
-}
-
-/// The bootloader of a lift always has the same node-ID; its program can be saved.
-#[test]
-fn a_lift_is_updated_and_saved() {
-    let folder = folder("lift");
-    let two = ["--board", "stm32f407g-disc1-two"];
-    let options = ["--node", "5", "--flash", "instant", "--stand-in", "--stay", "--profile", "lift"];
-    let nodes = Nodes::start(&folder, &[&options[..], &two].concat());
-    let coflash = Coflash::new(&folder, &nodes);
-    let on = ["-N", "126", "--unlock", "coboot"];
-    assert_eq!(coflash.json(&["info", "-N", "126"])["dialect"], "lift");
-    let locked = coflash.run(&["read", "1F50/1", "-N", "126"]);
-    assert_eq!(locked.exit, 6, "{}", locked.err);
-    let without = coflash.run(&[&["flash", "program.bin", "-I", "binary", "-N", "126"][..], &two].concat());
-    assert_eq!(without.exit, 2, "{}", without.err);
-    assert!(without.err.contains("--unlock"), "{}", without.err);
-    let image = labelled();
-    folder.write("lift.bin", &image);
-    let flash = ["flash", "lift.bin", "-I", "binary", "--no-start"];
-    assert_eq!(coflash.json(&[&flash[..], &two, &on].concat())["dialect"], "lift");
-    coflash.done(&[&["read", "1F50/1", "-o", "saved.bin"][..], &on].concat());
-    assert_eq!(folder.read("saved.bin"), image);
 }

@@ -4,7 +4,6 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::time::Duration;
 
 use crate::bus::{self, node, Coflash, Folder, Nodes, FLASH, VECTORS};
 
@@ -144,38 +143,6 @@ fn a_node_with_crc_16_starts_its_programs() {
     nodes.await_line("serial 1, node 7: would start program 1");
 }
 
-#[test]
-fn many_nodes_take_their_programs_at_the_same_time() {
-    let (folder, _nodes, coflash) =
-        start("many", &["--node", "10", "--count", "5", "--stand-in", "--serial", "0x100"]);
-    coflash.done(&[FLASH, &["-N", "10-14", "--at-once", "5"]].concat());
-    for serial in 0x100..0x105 {
-        assert!(folder.read(&format!("{serial}.flash"))[0x2_0000..] == flashed(), "{serial}");
-    }
-    let scan = coflash.json(&["scan", "-N", "9-15", "--sdo-timeout", "500"]);
-    let found: Vec<_> = scan["nodes"].as_array().unwrap().iter().map(|found| &found["node"]).collect();
-    assert_eq!(found, [10, 11, 12, 13, 14]);
-    assert_eq!(scan["nodes"][4]["info"]["serial_number"], 0x104);
-}
-
-#[test]
-fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
-    let (folder, nodes, coflash) = start("cut", &["--node", "5", "--stand-in"]);
-    coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
-    // Replaces the old program, which is lost with the first block.
-    let flashing = coflash.spawn(&[FLASH, &["-N", "5"]].concat());
-    let beginning = program()[..0x400].to_vec();
-    while folder.read("1.flash")[0x2_0000..0x2_0400] == beginning {
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    drop(nodes);
-    assert_eq!(flashing.wait().exit, 4, "the adapter is gone");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
-    nodes.await_line("serial 1, node 5: bootloader (NoProgram)");
-    Coflash::new(&folder, &nodes).done(&[FLASH, &["-N", "5"]].concat());
-    assert!(folder.read("1.flash")[0x2_0000..] == flashed());
-}
-
 /// The same file goes on where the device's power was cut; with `--from-start` it does not; another
 /// file begins at its start.
 #[test]
@@ -256,73 +223,6 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     coflash.done(&[&["lss", "store"][..], &device].concat());
 }
 
-/// From the factory to a running program in one job: the node-ID that a device gets by its LSS
-/// address survives the restart.
-#[test]
-fn a_device_without_node_id_is_given_one_and_flashed_in_one_job() {
-    let folder = folder("lss-job");
-    let nodes = Nodes::start(
-        &folder,
-        &["--unconfigured", "--serial", "77", "--product-code", "0x1234", "--flash", "instant", "--stand-in"],
-    );
-    folder.write(
-        "job.toml",
-        b"[[program]]\nimage = 'program.bin'\nnodes = [23]\n\
-          lss = { vendor = 0, product = 0x1234, revision = 0x10000, serial = 77 }\n",
-    );
-    let coflash = Coflash::new(&folder, &nodes);
-    let options = &FLASH[2..];
-    coflash.done(&[&["flash", "--job", "job.toml"][..], options].concat());
-    assert_eq!(coflash.json(&["read", "1018/4", "-N", "23"])["number"], 77);
-    let said = coflash.done(&["info", "-N", "23"]);
-    assert!(said.contains("application"), "{said}");
-}
-
-/// A device of another product: nothing is lost, and the exit code is the manual's number.
-#[test]
-fn a_program_for_another_product_is_refused() {
-    let (folder, _nodes, coflash) =
-        start("product", &["--node", "5", "--product-code", "99", "--flash", "instant"]);
-    coflash.done(&[FLASH, &["-N", "5", "--no-start", "--vid", "0", "--pid", "99"]].concat());
-    let before = folder.read("1.flash");
-    let said = coflash.run(&[FLASH, &["-N", "5", "--vid", "0", "--pid", "98"]].concat());
-    assert_eq!(said.exit, 6, "{}", said.err);
-    assert!(said.err.contains("60000182"), "{}", said.err);
-    assert!(said.err.contains("it was not changed"), "{}", said.err);
-    assert!(folder.read("1.flash")[0x2_0000..] == before[0x2_0000..]);
-}
-
-/// A node has no identity unless it is given one, and takes any program: the first example of the page.
-#[test]
-fn a_node_without_identity_takes_a_program_with_one() {
-    let (_folder, _nodes, coflash) = start("nobody", &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let named = ["-N", "5", "--vid", "0x3F", "--pid", "0x4007D151"];
-    coflash.done(&[FLASH, &named].concat());
-    coflash.done(&[FLASH, &named, &["--check-target"]].concat());
-}
-
-/// One of three devices that are updated together is another product: it refuses alone.
-#[test]
-fn another_product_among_the_devices_of_a_group_refuses_alone() {
-    let folder = folder("group");
-    let wanted = ["--node", "1", "--count", "2", "--product-code", "98", "--flash", "instant"];
-    let nodes = Nodes::start(&folder, &wanted);
-    let other = ["--node", "3", "--serial", "3", "--product-code", "99", "--flash", "instant"];
-    let other = Nodes::join(&folder, nodes.url(), &other);
-    other.await_line("serial 3, node 3: bootloader (NoProgram)");
-    let coflash = Coflash::new(&folder, &nodes);
-    let flash = ["-N", "1-3", "--together=always", "--no-start", "--vid", "0", "--pid", "98"];
-    let said = coflash.run(&[FLASH, &flash].concat());
-    assert_eq!(said.exit, 8, "{}{}", said.out, said.err);
-    let refusal = "node 3: error: the program is for product code 00000062h, and node 3 has 00000063h";
-    assert!(said.out.contains(refusal) && said.out.contains("2 of 3 devices are done"), "{}", said.out);
-    assert!(said.out.contains("together"), "{}", said.out);
-    for serial in 1..=2 {
-        assert!(folder.read(&format!("{serial}.flash"))[0x2_0000..] == flashed(), "{serial}");
-    }
-    assert!(folder.read("3.flash")[0x2_0000..].iter().all(|byte| *byte == 0xFF));
-}
-
 #[test]
 fn two_programs_have_their_places() {
     let (folder, nodes, coflash) =
@@ -355,22 +255,6 @@ fn two_programs_have_their_places() {
     // Another program than the running one is started by way of the bootloader.
     coflash.done(&["start", "-N", "1", "-P", "1"]);
     nodes.await_line("serial 1, node 1: would start program 1");
-}
-
-/// A download in one transfer, then started: the first 80h confirms it, and coflash calls again;
-/// the bootloader answers STOP.
-#[test]
-fn a_fresh_program_is_called_back_all_the_same() {
-    let (_folder, nodes, coflash) = start("fresh", &["--node", "7", "--flash", "instant", "--stand-in"]);
-    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw"]].concat());
-    nodes.await_line("serial 1, node 7: would start program 1");
-    assert!(coflash.done(&["enter", "-N", "7"]).contains("the bootloader is running"));
-    nodes.await_line("serial 1, node 7: bootloader (Requested)");
-    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw"]].concat());
-    nodes.await_line("serial 1, node 7: would start program 1");
-    // From the running program, by STOP.
-    coflash.done(&[FLASH, &["-N", "7", "--dialect", "raw", "--no-start"]].concat());
-    nodes.await_line("serial 1, node 7: bootloader (Requested)");
 }
 
 /// A node on an existing bus: here the bus of other nodes.
@@ -430,62 +314,6 @@ fn clients_that_misbehave_harm_nobody() {
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
     assert!(folder.read("1.flash")[0x2_0000..] == flashed());
     drop(silent);
-}
-
-/// An abandoned block download: other clients get answers, and NMT reset node is carried out while
-/// a client sends requests.
-#[test]
-fn an_abandoned_download_locks_nobody_out() {
-    let folder = folder("abandoned");
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--heartbeat", "0"]);
-    let mut stream = TcpStream::connect(nodes.address()).unwrap();
-    stream.set_nodelay(true).unwrap();
-    let say =
-        |stream: &mut TcpStream, text: &str| stream.write_all(format!("< {text} >").as_bytes()).unwrap();
-    assert_eq!(crate::bus::message(&mut stream), "< hi >");
-    for mode in ["open can0", "rawmode"] {
-        say(&mut stream, mode);
-        assert_eq!(crate::bus::message(&mut stream), "< ok >");
-    }
-    // The next frame of the device, as identifier and data.
-    let heard = |stream: &mut TcpStream| {
-        let message = crate::bus::message(stream);
-        let words: Vec<&str> = message.split_whitespace().collect();
-        format!("{}#{}", words[2], words[4])
-    };
-    let abandon = |stream: &mut TcpStream| {
-        say(stream, "send 605 8 C2 50 1F 01 00 10 00 00");
-        while heard(stream) != "585#A4501F014A000000" {}
-        for seqno in 1..4 {
-            say(stream, &format!("send 605 8 {seqno} 0 0 0 0 0 0 0"));
-        }
-    };
-    const ASK: &str = "send 605 8 40 00 10 00 00 00 00 00";
-    abandon(&mut stream);
-    say(&mut stream, ASK);
-    let first = heard(&mut stream);
-    // On a busy machine the request may arrive after the pause of the sub-block has ended.
-    let answer = if first == "585#A2034A0000000000" { heard(&mut stream) } else { first };
-    assert_eq!(answer, "585#4300100000000010");
-    abandon(&mut stream);
-    say(&mut stream, "send 0 2 81 05");
-    let mut asker = stream.try_clone().unwrap();
-    let asking = std::thread::spawn(move || {
-        for _ in 0..20 {
-            if asker.write_all(format!("< {ASK} >").as_bytes()).is_err() {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(100));
-        }
-    });
-    let mut answers = 0;
-    while heard(&mut stream) != "705#00" {
-        answers += 1;
-    }
-    // The reset takes 15 ms, so no request or, on a busy machine, a few requests are answered
-    // before it; it would be twenty if the device waited for the end of the transfer.
-    assert!(answers < 15, "{answers}");
-    asking.join().unwrap();
 }
 
 #[test]

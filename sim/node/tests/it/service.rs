@@ -189,23 +189,6 @@ fn events_are_one_object_a_line() {
     assert_eq!((done.exit, &line["error"]["exit"], done.err.as_str()), (2, &2.into(), ""));
 }
 
-/// The advice for a silent device comes from the bus, for one device and for several.
-#[test]
-fn a_silent_device_of_several_is_diagnosed_as_one_alone() {
-    let (_folder, _nodes, coflash) = start("silent", &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let quick = ["--boot-timeout", "300", "--sdo-timeout", "100", "--json", "--no-start"];
-    let alone = coflash.run(&[FLASH, &["-N", "9"], &quick].concat());
-    let [alone] = lines(&alone.out).try_into().unwrap();
-    let advice = alone["error"]["advice"].as_str().unwrap();
-    assert!(advice.contains("the bus works, and node 5 is heard: check that node 9"), "{alone}");
-    let several = coflash.run(&[FLASH, &["-N", "5,9,10"], &quick].concat());
-    let [several] = lines(&several.out).try_into().unwrap();
-    let of = |device: usize| several["devices"][device]["error"]["advice"].clone();
-    assert_eq!(of(1), advice, "{several}");
-    assert_eq!(of(2), advice.replace("node 9", "node 10"), "{several}");
-    assert_eq!(several["devices"][0]["ok"], true);
-}
-
 /// The only folder in a folder.
 fn only(folder: &Path) -> PathBuf {
     let all: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -262,28 +245,4 @@ fn a_report_has_what_service_needs_and_no_password() {
     assert!(line.exit == 2 && line.err.contains("apply only to the shell as a whole"), "{}", line.err);
     let nowhere = coflash.run(&["info", "-N", "5", "--log-file", "none/info.log"]);
     assert!(nowhere.exit == 1 && nowhere.err.contains("cannot be written"), "{}", nowhere.err);
-}
-
-/// A board that no list contains, from the file of `cargo xtask layout --toml`.
-#[test]
-fn a_layout_comes_from_a_file() {
-    let folder = folder("layout");
-    let board = shared_abi::layout::toml::Toml(&shared_abi::layout::stm32f407g_disc1::LAYOUT).to_string();
-    let board = board.replace("stm32f407g-disc1", "my-board");
-    folder.write("board.toml", board.as_bytes());
-    folder.write("bad.toml", board.replace("base = 0x08020000", "base = 0x0801c000").as_bytes());
-    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
-    let coflash = Coflash::new(&folder, &nodes);
-    let flash =
-        |layout: &str| coflash.run(&["flash", "program.bin", "-I", "binary", "--board", layout, "-N", "5"]);
-    assert_eq!(flash("board.toml").exit, 0);
-    let bad = flash("bad.toml");
-    assert!(
-        bad.exit == 3 && bad.err.contains("bad.toml: a program must start and end at sector borders"),
-        "{}",
-        bad.err
-    );
-    assert_eq!(flash("none.toml").exit, 3);
-    let two = coflash.run(&["convert", "program.bin", "--board", "board.toml", "-I", "binary", "-P", "2"]);
-    assert!(two.err.contains("my-board has no program 2"), "{}", two.err);
 }
