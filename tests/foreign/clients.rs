@@ -1,11 +1,10 @@
-//! Foreign programs, unmodified, and our own command line: against the emulated device through the
-//! socketcand endpoint.
+//! Foreign programs, unmodified, against the emulated device through the socketcand endpoint.
 
 use canopen::BitRate;
-use coboot_tests::bench::Bench;
+use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coboot_tests::tools::{coflash, script, text};
+use coboot_tests::tools::{script, text};
 use coflash_core::file::block_file::emit;
 
 const VERSION: u16 = 0x100A;
@@ -61,6 +60,22 @@ fn python_canopen_updates_the_device_by_raw_images() {
     endpoint.bench.assert_nothing_unmodelled();
 }
 
+/// Bootloader and application; python-canopen uses no protocol switch threshold. Clients with one, like
+/// CANopenNode: `core/canopen/tests/it/block.rs` and `tests/update/choices.rs`.
+#[test]
+#[cfg_attr(not(split_map), ignore = "needs the split map")]
+fn python_canopen_reads_objects_by_block_upload() {
+    let bootloader = Bench::new().switched_on();
+    for bench in [bootloader, Bench::running(BitRate::K125, firmware::APP_V1)] {
+        let mut endpoint = Endpoint::new(bench);
+        let mut client = script("block_upload_client.py");
+        let said = endpoint.succeed(client.arg(endpoint.address()).arg(NODE.to_string()));
+        let name: String = bsp::IDENTITY.device_name.bytes().map(|byte| format!("{byte:02x}")).collect();
+        assert!(said.contains(&format!("1008h/0: {name}\n")), "{said}");
+        endpoint.bench.assert_nothing_unmodelled();
+    }
+}
+
 /// The asyncio port of the same client, with its own calls: in segments, with an SDO time-out of 2
 /// s.
 #[test]
@@ -94,48 +109,5 @@ fn public_scripts_update_the_device_twice_in_a_row() {
             assert_eq!(endpoint.bench.text(VERSION), version, "{order}");
         }
         endpoint.bench.assert_nothing_unmodelled();
-    }
-}
-
-#[test]
-fn the_coflash_command_does_the_main_job_through_a_socket() {
-    let mut endpoint = endpoint();
-    let url = endpoint.url();
-    let said = endpoint.succeed(coflash().args(["--bus", &url, "info"]));
-    assert!(said.contains("the bootloader"), "{said}");
-    // The second time an application runs: it is called back.
-    for (image, version) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
-        let file = firmware::dir().join(image);
-        println!("{}", endpoint.succeed(coflash().args(["--bus", &url, "flash"]).arg(file)));
-        assert_eq!(endpoint.bench.text(VERSION), version);
-    }
-}
-
-/// A file that cannot be flashed is refused before the device is changed.
-#[test]
-fn a_bad_file_touches_no_device() {
-    let mut endpoint = endpoint();
-    let elf = firmware::elf(firmware::APP_V1);
-    let mut damaged = emit(&firmware::blocks(firmware::APP_V1));
-    damaged[100] ^= 1;
-    let (_, resident) = firmware::section(&firmware::elf(firmware::BOOTLOADER), ".resident");
-    let folder = kit::folder!("bad-files");
-    for (name, bytes) in [
-        ("truncated.elf", &elf[..elf.len() / 2]),
-        ("empty.hex", &[]),
-        ("resident.bin", &resident),
-        ("damaged.blk", &damaged),
-        ("checksum.hex", b":020000040801F1\n:0400000000C0012017\n:00000001FF\n"),
-    ] {
-        let path = folder.write(name, bytes);
-        let from = endpoint.bench.time();
-        let mut command = coflash();
-        command.args(["--bus", &endpoint.url(), "flash", "--board", firmware::board().board]).arg(&path);
-        let output = endpoint.run(&mut command);
-        assert!(!output.status.success(), "{name}");
-        assert!(text(&output).contains(name), "{name} is not named in: {}", text(&output));
-        let sdo =
-            endpoint.bench.frames_since(from).into_iter().find(|(_, id, _)| (0x580..0x680).contains(id));
-        assert_eq!(sdo, None, "{name}: the device was talked to");
     }
 }

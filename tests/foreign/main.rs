@@ -1,7 +1,5 @@
 //! What works with programs of others, unmodified: clients, debuggers, compilers, a browser.
 
-#[cfg(split_map)]
-mod block_upload;
 mod clients;
 mod eds;
 #[cfg(reference_board)]

@@ -15,8 +15,6 @@ mod powercut_board;
 mod recording;
 #[cfg(staging)]
 mod renewal;
-#[cfg(staging)]
-mod renewal_states;
 #[cfg(split_map)]
 mod resume;
 mod streams;

@@ -1,22 +1,18 @@
 //! `coflash` renews the bootloader of a device while its program stays (docs/renewal.md).
 
-use std::process::Command;
-
-use canopen::program::FlashError;
+use canopen::program::{ProgramControl, PROGRAM_DATA};
+use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::endpoint::Endpoint;
-use coboot_tests::firmware;
-use coboot_tests::renewal::{image_of, number, plain, running, version};
-use coboot_tests::sealed_board;
+use coboot_tests::renewal::{confirm, image_of, number, plain, progress, running, stage, start, version};
+use coboot_tests::{firmware, sealed_board};
 use coflash_core::device::{info, Doing};
-use coflash_core::file::read::{read, Format};
 use coflash_core::update::event::Phase;
 use coflash_core::update::{flash, Event, FlashOptions, Password, Payload, Renewal};
 use coflash_core::Error;
 use emulator::machine::{Cut, FlashCut, Operation};
 use shared_abi::handoff::ResetCause;
 use shared_abi::ram_image::Version;
-use shared_abi::renewal::{Progress, State, TrialEnd};
+use shared_abi::renewal::{Origin, State, TrialEnd};
 
 const NEW: u32 = 0x0009_0001;
 
@@ -40,11 +36,6 @@ fn renewed(bench: &mut Bench, new: &Payload) -> (Result<Renewal, Error>, Vec<Pha
         }
     });
     (result.map(|report| report.renewal.unwrap()), phases)
-}
-
-fn progress(bench: &mut Bench) -> Progress {
-    let bootloader = info(&mut bench.session()).unwrap().bootloader.expect("it can be renewed");
-    bootloader.running.expect("it runs").progress
 }
 
 fn call_back(bench: &mut Bench) {
@@ -134,25 +125,50 @@ fn an_interrupted_renewal_goes_on_when_it_is_started_again() {
     }
 }
 
-/// A program in the way is named, and so is what to do about it.
+/// What an earlier renewal has left: the image that was installed and still runs from staging; a trial
+/// that somebody has left open; an image over which another download was broken off; and what a tool
+/// has done that knows nothing of this one.
 #[test]
-fn a_program_that_reaches_into_staging_is_named() {
+fn a_renewal_goes_on_from_what_another_one_has_left() {
+    const NEXT: u32 = 0x0009_0002;
+    let first = version(firmware::BOOTLOADER, NEW);
+    let to = |bench: &mut Bench, to| renewed(bench, &plain(&version(firmware::BOOTLOADER, to))).0.unwrap();
     let mut bench = Bench::new().switched_on();
-    let staging = firmware::board().staging.unwrap();
-    let large =
-        firmware::made_up((staging.base - firmware::board().programs[0].base) as usize + 64, |at| at as u8);
-    let blocks = coflash_core::file::convert::program_of(
-        read(&large, Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap(),
-        &coflash_core::file::convert::Options::default(),
-    );
-    let options = FlashOptions::default().trial_run(false).start(false).force(true);
-    flash(&mut bench.session(), &blocks.unwrap().program, &options, &mut |_| {}).unwrap();
-    let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
-    let Err(error @ Error::Failed { error: FlashError::NotCleared, detail: 1, .. }) = result else {
-        panic!("{result:?}")
-    };
-    assert!(error.to_string().contains("program 1 reaches into the flash where a new bootloader waits"));
-    assert!(error.advice().to_string().contains("coflash erase --program 1"));
+    assert_eq!(to(&mut bench, NEW).to, Version(NEW));
+    let Renewal { unchanged, from, .. } = to(&mut bench, NEW);
+    assert_eq!((unchanged, from), (true, Version(NEW)));
+    let Renewal { unchanged, from, to: next, .. } = to(&mut bench, NEXT);
+    assert_eq!((unchanged, from, next), (false, Version(NEW), Version(NEXT)));
+    assert!(bench.is_bootloader(NODE));
+    bench.assert_nothing_unmodelled();
+
+    // The same image is confirmed, another one is given up first.
+    for wanted in [NEW, NEXT] {
+        let mut bench = Bench::new().switched_on();
+        stage(&mut bench, &first);
+        start(&mut bench);
+        assert_eq!(progress(&mut bench).origin, Origin::Trial);
+        assert_eq!(to(&mut bench, wanted).to, Version(wanted));
+        assert_eq!((running(&mut bench), progress(&mut bench).state), (wanted, State::Installed));
+    }
+
+    let mut bench = Bench::new().switched_on();
+    stage(&mut bench, &first);
+    bench.session().command(number(), ProgramControl::Clear).unwrap();
+    let mut broken = version(firmware::BOOTLOADER, NEXT);
+    broken[2000] ^= 1;
+    let at = Address::new(PROGRAM_DATA, number());
+    let _ = bench.session().write(at, &broken, Doing::Write(at), &mut |_| {});
+    bench.session().await_idle(number(), Doing::Write(at)).unwrap();
+    assert_eq!(progress(&mut bench).state, State::None);
+    assert!(!to(&mut bench, NEW).unchanged);
+    assert_eq!(running(&mut bench), NEW);
+
+    let mut bench = Bench::new().switched_on();
+    stage(&mut bench, &first);
+    start(&mut bench);
+    confirm(&mut bench);
+    assert!(to(&mut bench, NEW).unchanged);
 }
 
 /// Each program that it installs would have another CRC than the resident part computes.
@@ -181,13 +197,6 @@ fn an_unsigned_bootloader_is_refused_before_the_call() {
     assert!(matches!(result, Err(Error::SealedOnly { .. })), "{result:?}");
     let erased = |operation: &Operation| matches!(operation, Operation::Erase { .. });
     assert!(!bench.machine().take_flash_log().iter().any(erased));
-}
-
-#[test]
-fn a_bootloader_without_renewal_says_so() {
-    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST).switched_on();
-    let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
-    assert!(matches!(result, Err(Error::NotRenewable { .. })), "{result:?}");
 }
 
 /// A bootloader with a password, at this node: with the right one it is renewed, with another one refused
@@ -228,24 +237,4 @@ fn assert_wants_a_password(bootloader: &str, node: u8, right: Option<&str>, othe
 fn a_bootloader_with_a_password_is_renewed_with_it_and_refused_without() {
     assert_wants_a_password(firmware::BOOTLOADER_ESACADEMY, 64, None, &[Some("0x57726F6E")]);
     assert_wants_a_password(firmware::BOOTLOADER_LIFT, 126, Some("coboot"), &[None, Some("Coboot")]);
-}
-
-/// The command line, in real time.
-#[test]
-fn coflash_flash_knows_a_bootloader_by_its_header() {
-    let mut endpoint = Endpoint::new(board());
-    let file = firmware::dir().join(firmware::BOOTLOADER_WATCHDOG);
-    let url = endpoint.url();
-    let coflash = std::env::var("COBOOT_COFLASH").expect("cargo xtask test sets it");
-    let output = endpoint.run(Command::new(&coflash).args(["--bus", &url, "flash"]).arg(&file));
-    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    println!("{said}");
-    assert!(output.status.success(), "{said}");
-    for words in
-        ["renewing the bootloader (program 2): version 0.1 -> 0.1", "installed: bootloader 0.1", "done in "]
-    {
-        assert!(said.contains(words), "{words}: {said}");
-    }
-    let output = endpoint.run(Command::new(&coflash).args(["--bus", &url, "flash", "--no-trial"]).arg(&file));
-    assert_eq!(output.status.code(), Some(2));
 }

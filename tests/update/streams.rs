@@ -116,42 +116,6 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
     }
 }
 
-/// A master as in CiA 302-2 and 302-3, which knows nothing of coboot, updates a running device: it
-/// compares 1F56h, stops the program, clears it, sends the new one, waits for 1F57h, compares,
-/// starts, and reads 1F51h and 1F56h of the application.
-#[test]
-fn a_cia_302_master_updates_a_running_device() {
-    let old = throughput::program(20);
-    let mut new = throughput::program(21);
-    new.truncate(20 * 1024 + 333);
-    // It either stops the program first, or clears it at once.
-    for stop in [true, false] {
-        let mut bench = board_at_1_mbit(Options::default());
-        let by = Transfers::Segments;
-        write(&mut bench, CONTROL, &[CLEAR], by);
-        write(&mut bench, DATA, &old, by);
-        write(&mut bench, CONTROL, &[1], by);
-        bench.await_boot_up(2000);
-
-        assert_ne!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new), "it needs an update");
-        // The bootloader answers the first of these commands after its boot-up message.
-        if stop {
-            write(&mut bench, CONTROL, &[0], by);
-            assert_eq!(bench.session().read_number(CONTROL).unwrap(), 0, "stopped");
-        }
-        write(&mut bench, CONTROL, &[CLEAR], by);
-        assert!(bench.is_bootloader(NODE));
-        write(&mut bench, DATA, &new, by);
-        let status = bench.session().await_idle(1, Doing::Read(DATA)).unwrap();
-        assert_eq!(status.to_word(), 0);
-        assert_eq!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new));
-        write(&mut bench, CONTROL, &[1], by);
-        bench.await_boot_up(1000);
-        assert_eq!(bench.session().read_number(CONTROL).unwrap(), 1, "running");
-        assert_eq!(bench.session().read_number(IDENTIFICATION).unwrap(), crc32(&new));
-    }
-}
-
 /// Reset program, written to the application, restarts it; after a CLEAR to the application no
 /// second CLEAR is necessary.
 #[test]
