@@ -160,22 +160,6 @@ fn a_deployment_reaches_the_device_and_its_result_the_server() {
     assert_eq!(fake.given().len(), 1);
 }
 
-#[test]
-fn the_same_action_twice_is_flashed_once() {
-    let (server, folder, fake) = (Server::start(&[ID]), folder("twice"), Fake::default());
-    server.assign(ID, Action::new(3, &file()));
-    once(&server, &folder, &fake, &[ID]);
-    // The server has lost its memory, and gives the action again.
-    server.assign(ID, Action::new(3, &file()));
-    let (ended, said) = once(&server, &folder, &fake, &[ID]);
-    assert_eq!(server.action(ID).result.as_deref(), Some("success"), "{said}");
-    assert_eq!((fake.given().len(), ended.updated), (1, 0));
-    // Another action with the same file is another matter.
-    server.assign(ID, Action::new(4, &file()));
-    once(&server, &folder, &fake, &[ID]);
-    assert_eq!(fake.given().len(), 2);
-}
-
 /// Each attempt brings the same bytes again.
 #[test]
 fn a_server_that_knows_no_parts_and_breaks_off_is_given_up() {
@@ -374,41 +358,6 @@ fn a_cancellation_before_the_update_is_accepted() {
     server.assign(ID, Action { window: Some("available"), ..Action::new(4, &file()) });
     once(&server, &folder, &fake, &[ID]);
     assert_eq!((fake.given().len(), server.seen("artifacts").len()), (1, 1));
-}
-
-#[test]
-fn what_was_interrupted_goes_on_after_a_restart() {
-    let (server, folder) = (Server::start(&[ID]), folder("restart"));
-    server.assign(ID, Action::new(3, &file()));
-    let fake = Fake { answers: Mutex::new(vec![Flashed::Interrupted]), ..Fake::default() };
-    while_it_runs(&server, &folder, &fake, |_| {
-        server.wait("the update", |_| !fake.given().is_empty());
-    });
-    // As after Ctrl-C: the server knows nothing of an end.
-    assert_eq!(server.action(ID).result, None);
-    let (ended, said) = once(&server, &folder, &fake, &[ID]);
-    assert!(said.contains("was interrupted"), "{said}");
-    assert_eq!((ended.updated, fake.given().len()), (1, 2), "{said}");
-    assert!(server.action(ID).feedback.iter().any(|(execution, _)| execution == "resumed"));
-    assert_eq!(server.action(ID).result.as_deref(), Some("success"));
-}
-
-#[test]
-fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
-    let (folder, (server, fake, busy)) = (folder("late"), busy());
-    while_it_runs(&server, &folder, &fake, |_| {
-        server.wait("progress", |state| action(state).progress.contains(&40));
-        server.fault("feedback", 1000, Fault::Status(500, None));
-        busy.store(false, Ordering::Relaxed);
-        server.wait("an attempt", |state| {
-            state.seen.iter().any(|seen| seen.body["status"]["execution"] == "closed")
-        });
-    });
-    assert_eq!(server.action(ID).result, None);
-    server.state().faults.clear();
-    let (ended, _) = once(&server, &folder, &fake, &[ID]);
-    assert_eq!(server.action(ID).result.as_deref(), Some("success"));
-    assert_eq!((fake.given().len(), ended.updated), (1, 0));
 }
 
 #[test]

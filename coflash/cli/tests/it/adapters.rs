@@ -6,16 +6,15 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use crate::commands::quick;
 use crate::tool::kernel::{converse, standard};
 use crate::tool::{coflash, data};
 use canopen::Frame;
 use embedded_can::{Frame as _, StandardId};
 use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
 
-fn device() -> Fake {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
+pub fn device() -> Fake {
+    let mut fake = quick(BOOTLOADER);
     fake.knows_blocks = Blocks::Known(127);
     fake
 }

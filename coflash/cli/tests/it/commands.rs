@@ -12,7 +12,7 @@ use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 /// A device without delays.
-fn quick(running: u32) -> Fake {
+pub fn quick(running: u32) -> Fake {
     let mut fake = Fake::new(running);
     fake.erase_time = Duration::from_millis(30);
     fake.restart_time = Duration::from_millis(20);
@@ -249,6 +249,35 @@ fn a_program_is_read_back_where_the_device_allows_it() {
     let (said, json, _) = on(|| quick(BOOTLOADER), &["read", "1F50/1"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000025".into()));
     assert!(said.err.contains("abort 06010001h"), "{}", said.err);
+    let none = folder.path("none.bin");
+    let (said, ..) = on(|| quick(BOOTLOADER), &["read", "1F50/1", "-o", &none]);
+    assert!(said.exit == 6 && !std::path::Path::new(&none).exists(), "{}", said.err);
+}
+
+/// A lift is known by its own objects, and does nothing without its password.
+#[test]
+fn a_lift_wants_its_password() {
+    use kit::fake::lift::{Lift, PHRASE};
+    let folder = folder("lift");
+    let (file, back) = (data("plain-400.blk"), folder.path("back.bin"));
+    let lift = || Lift::fake(APPLICATION, |_| {}).0;
+    let (_, json, _) = on(lift, &["info"]);
+    assert_eq!(json["dialect"], "lift");
+    for (words, exit, why) in [
+        (&["read", "1F50/1"][..], 6, "refuses reading 1F50h/1"),
+        (&["flash", &file], 2, "--unlock"),
+        (&["flash", &file, "--unlock", "wrong"], 6, "password"),
+        // That one's password would erase the program that is to be read.
+        (&["read", "1F50/1", "--dialect", "esacademy", "--unlock", "INIT"], 2, ""),
+    ] {
+        let (said, _, fake) = on(lift, words);
+        said.fails(exit, &[why]);
+        assert_eq!(fake.running, Some(APPLICATION), "{words:?}");
+    }
+    let (_, json, _) = on(lift, &["flash", &file, "--unlock", PHRASE]);
+    assert_eq!((&json["dialect"], &json["running"]), (&"lift".into(), &APPLICATION.into()));
+    on(lift, &["read", "1F50/1", "--unlock", PHRASE, "-o", &back]).0.good();
+    assert_eq!(fs::read(back).unwrap(), b"what was stored");
 }
 
 #[test]

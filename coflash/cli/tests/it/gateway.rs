@@ -8,12 +8,15 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use base64::engine::general_purpose::STANDARD as BASE64;
+use base64::Engine as _;
 use canopen::{Address, NodeId};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
 use coboot_can::Cia309;
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::Error;
 
+use crate::commands::quick;
 use crate::tool::{coflash, data};
 use kit::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
@@ -51,36 +54,6 @@ fn gateway(mut play: Play) -> (String, Lines, thread::JoinHandle<()>) {
     (address, lines, server)
 }
 
-/// Bit by bit, from RFC 2045's table.
-fn of_base64(text: &str) -> Vec<u8> {
-    let value = |digit: char| match digit {
-        'A'..='Z' => digit as u32 - 65,
-        'a'..='z' => digit as u32 - 71,
-        '0'..='9' => digit as u32 + 4,
-        '+' => 62,
-        '/' => 63,
-        _ => panic!("{digit}"),
-    };
-    let digits: Vec<u32> = text.trim_end_matches('=').chars().map(value).collect();
-    let bits = digits.iter().flat_map(|digit| (0..6).rev().map(move |bit| digit >> bit & 1));
-    let bits: Vec<u32> = bits.collect();
-    bits.chunks_exact(8).map(|byte| byte.iter().fold(0, |byte, bit| byte << 1 | *bit as u8)).collect()
-}
-
-fn to_base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let bits: Vec<u8> = bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1)).collect();
-    let digits = bits.chunks(6).map(|group| {
-        let value = group.iter().chain([0; 6].iter()).take(6).fold(0, |value, bit| value << 1 | bit);
-        char::from(DIGITS[usize::from(value)])
-    });
-    let mut text: String = digits.collect();
-    while !text.len().is_multiple_of(4) {
-        text.push('=');
-    }
-    text
-}
-
 /// A gateway to network 3 with this device: it has its own SDO client on the bus.
 struct Behind {
     fake: Fake,
@@ -106,7 +79,7 @@ impl Behind {
             ["3", node, "r", index, sub, "d"] => {
                 let at = address(index, sub);
                 match self.session(node).read_once(at) {
-                    Ok(value) => to_base64(&value),
+                    Ok(value) => BASE64.encode(value),
                     Err(error) => failure(&error),
                 }
             }
@@ -116,7 +89,7 @@ impl Behind {
                     "u8" => vec![u8::try_from(number()).unwrap()],
                     "u16" => u16::try_from(number()).unwrap().to_le_bytes().to_vec(),
                     "u32" => number().to_le_bytes().to_vec(),
-                    "d" => of_base64(value),
+                    "d" => BASE64.decode(value).unwrap(),
                     other => panic!("{other}"),
                 };
                 let at = address(index, sub);
@@ -150,13 +123,6 @@ fn failure(error: &Error) -> String {
         Error::NoAnswer { .. } => "ERROR:103 #Time-out.".to_string(),
         other => panic!("{other}"),
     }
-}
-
-fn quick(running: u32) -> Fake {
-    let mut fake = Fake::new(running);
-    fake.erase_time = Duration::from_millis(5);
-    fake.restart_time = Duration::from_millis(10);
-    fake
 }
 
 /// A device behind a gateway: the URL of its network, its lines, and the device.
@@ -325,9 +291,8 @@ fn what_listens_to_the_bus_is_refused_in_words() {
 /// Reads 1000h of node 5 in network 1 through a gateway with these answers, with a short time
 /// limit.
 fn asked(
-    play: impl FnMut(&str) -> Option<String> + Send + 'static,
+    mut play: impl FnMut(&str) -> Option<String> + Send + 'static,
 ) -> (Result<Vec<u8>, GatewayError>, Cia309) {
-    let mut play = play;
     let set = move |line: &str| match line.split_once("] 1 set sdo_timeout ") {
         Some((number, _)) => Some(format!("{number}] OK\r\n")),
         None => play(line),

@@ -2,12 +2,12 @@
 
 use std::fs;
 use std::net::TcpListener;
-use std::time::Duration;
 
 use super::adapters::serve_slcan;
+use crate::commands::quick;
 use crate::tool::{coflash, data, folder, run, typed, Done};
 use kit::fake::renewal::image;
-use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
+use kit::fake::{serve, Outcome, APPLICATION, BOOTLOADER};
 
 /// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {
@@ -16,13 +16,6 @@ fn shown(number: u32) -> i32 {
     } else {
         (number & 0xFF) as i32
     }
-}
-
-fn quick(running: u32) -> Fake {
-    let mut fake = Fake::new(running);
-    fake.erase_time = Duration::from_millis(5);
-    fake.restart_time = Duration::from_millis(10);
-    fake
 }
 
 /// Table 5 of the older manual and table 10 of the newer one: the values of ERRORLEVEL.
@@ -196,9 +189,13 @@ fn the_examples_of_dotnetflashtool_word_by_word() {
 fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
     for (call, trials) in [
         ("blcop_app.bin -N 5", 1),
-        ("-P 1 -N 5 --timeout 500 blcop_app.bin", 1),
+        ("-P 1 -B 4 -N 5 --delay 20 --repeats 0x000400 --timeout 500 blcop_app.bin", 1),
         ("blcop_app.bin -N 5 --sdo_timeout 500 --chk_tgt 0 --device_no 255", 1),
-        ("-F blcop_app.bin --node_id 5 --chk_run", 1),
+        (
+            "-F blcop_app.bin --node_id 0x05 --br_idx 4 --device_no 255 --prog_no 1 --chk_run --sdo_timeout 500 \
+             --chk_tgt 0 --vxd_type 4 --baudrate 500",
+            1,
+        ),
         ("blcop_app.bin --node_id 5", 0),
         ("blcop_app.bin -N 5 --prog_no 1", 0),
         ("-F blcop_app.bin -N 5", 0),
@@ -208,6 +205,7 @@ fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
         let done = dot_net("blcop_app.bin", call, &bus);
         assert_eq!(done.exit, 0, "{call}: {}", done.err);
         let fake = server.join().unwrap();
+        assert!(fake.blocks.concat() == fs::read(data("plain-400.blk")).unwrap(), "{call}");
         assert_eq!(fake.count("command 80"), trials, "{call}");
         assert_eq!(fake.count("command 83"), 1, "{call}");
         let said = trials == 0 && !call.contains("--no-trial");
@@ -251,6 +249,8 @@ fn words_that_contradict_each_other_are_refused() {
         (&["-F", &file, "--chk_run", "--no-trial"], "cannot be used with"),
         (&["-F", "–I"], "a value is required"),
         (&["-F", &file, "--prog_no", "0"], "programs are 1 to 254"),
+        (&[&file, "--gateway_id", "3"], "SDO gateway"),
+        (&[&file, "-B", "9"], "0 (1 Mbit/s) to 8"),
     ] {
         coflash(&[&["--bus", "socketcand://127.0.0.1:1/x", "flash"][..], words].concat())
             .fails(2, &[expected]);

@@ -402,6 +402,8 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
     let blocks = fs::read(data("plain-400.blk")).unwrap();
     let elf = fs::read(data("program.elf")).unwrap();
     let damaged = hex.replacen(":08", ":09", 1);
+    let mut damaged_blocks = blocks.clone();
+    damaged_blocks[100] ^= 1;
     let line = 1 + hex.lines().position(|line| line.starts_with(":08")).unwrap();
     // Another byte at 08010000h, where line 2 has put 00h.
     let twice = hex.replacen(":04000005", ":020000040801F1\n:0100000001FE\n:04000005", 1);
@@ -430,6 +432,12 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
             "far.hex, line 2: the data at 0x08000000..=0x08000007 lies outside 0x08010000..=0x0807ffff"
                 .to_string(),
         ),
+        (
+            "sum.hex",
+            b":020000040801F1\n:0400000000C0012017\n:00000001FF\n",
+            "sum.hex, line 2: checksum is 17 and must be 1B: the line is damaged".to_string(),
+        ),
+        ("damaged.blk", &damaged_blocks, "damaged.blk, offset 0x18: CRC of block 1 is ".to_string()),
         ("cut.blk", &blocks[..500], "cut.blk, offset 0x18: a block is cut off".to_string()),
         ("cut.elf", &elf[..200], "cut.elf: the file is cut off".to_string()),
     ] {
@@ -516,37 +524,6 @@ fn flash_and_info_over_a_socket() {
     let (bus, _server) = serve(fake);
     let done = run(crate::tool::command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus)).good();
     assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
-}
-
-/// The manual's calls (chapters 5.2 and 5.3) with the names of its options.
-#[test]
-fn a_script_for_the_manuals_download_tools_works() {
-    let file = data("identity-110.blk");
-    let download =
-        ["-P", "1", "-B", "4", "-N", "5", "--delay", "20", "--repeats", "0x000400", "--timeout", "500"];
-    let dot_net = ["--node_id", "0x05", "--br_idx", "4", "--device_no", "255", "--prog_no", "1", "--chk_run"];
-    let dot_net_2 = ["--sdo_timeout", "500", "--chk_tgt", "0", "--vxd_type", "4", "--baudrate", "500"];
-    for (options, dot_net) in [
-        ([&download[..], &[&file]].concat(), false),
-        ([&["-F", &file][..], &dot_net, &dot_net_2].concat(), true),
-    ] {
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.erase_time = Duration::from_millis(30);
-        fake.restart_time = Duration::from_millis(10);
-        let (bus, server) = serve(fake);
-        let done = coflash(&[&["--bus", &bus, "flash"][..], &options].concat()).good();
-        assert_eq!(done.err.contains("--vxd_type is ignored"), dot_net, "{}", done.err);
-        let fake = server.join().unwrap();
-        assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
-        assert_eq!(
-            fake.count("command 80"),
-            1,
-            "BinaryBlockDownload makes a trial, the other one with --chk_run"
-        );
-    }
-    for (option, value, words) in [("--gateway_id", "3", "SDO gateway"), ("-B", "9", "0 (1 Mbit/s) to 8")] {
-        coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]).fails(2, &[words]);
-    }
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! Sealed images and devices: downloads, refusals, rights, and the comparison of a device with a file.
 
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
+use crate::commands::quick;
 use crate::sealing::{crc32, program, unwrapped, word, Room, START, VENDOR};
 use crate::tool::{coflash, Done};
 use kit::fake::vault::Vault;
@@ -12,9 +12,7 @@ use serde_json::Value;
 /// Flashes this file; returns the output, the data for the device, and the other writes.
 fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>, Vec<String>) {
     let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
-    let mut fake = Fake::new(APPLICATION);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
+    let mut fake = quick(APPLICATION);
     fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room, status }));
     let (bus, server) = serve(fake);
     let done = coflash(&[&["flash", file, "--bus", &bus, "-N", "5"], more].concat());
@@ -222,9 +220,7 @@ impl Maker for Objects {
 
 /// Runs a command on such a device.
 fn on(running: u32, told: Objects, words: &[&str]) -> (Done, Fake) {
-    let mut fake = Fake::new(running);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
+    let mut fake = quick(running);
     fake.maker = Some(Box::new(told));
     let (bus, server) = serve(fake);
     let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());

@@ -7,11 +7,11 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
-use std::time::Duration;
 
+use crate::adapters::device;
 use crate::tool::kernel::{library, serve};
 use crate::tool::{data, folder, run, Done};
-use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
+use kit::fake::APPLICATION;
 use kit::folder::Folder;
 
 /// A folder with the library of a vendor.
@@ -35,14 +35,6 @@ fn command(folder: &Folder, lie: &str, arguments: &[&str]) -> Command {
     command.args(arguments).env("LD_LIBRARY_PATH", folder.as_os_str()).env("FAKE_LIE", lie);
     command.env("COFLASH_SEARCH", "peak,kvaser");
     command
-}
-
-fn device() -> Fake {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
-    fake.knows_blocks = Blocks::Known(127);
-    fake
 }
 
 /// A whole update over the stand-in.
