@@ -109,7 +109,7 @@ fn lost_repeated_and_late_frames_cost_time_and_nothing_else() {
 /// The bus at 125 kbit/s: answers take eight times as long.
 #[test]
 fn a_slow_bus_is_no_obstacle() {
-    let file = file(20);
+    let file = file(24);
     let mut fleet = Fleet::new(3, BitRate::K125);
     let all = fleet.update(3, &file, &ManyOptions::default());
     assert_eq!((all.done(), warnings(&all)), (3, vec![]));

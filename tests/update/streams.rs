@@ -39,7 +39,7 @@ fn board_at_1_mbit(options: Options) -> Bench {
 #[test]
 #[cfg_attr(not(split_map), ignore = "needs the split map")]
 fn a_program_in_one_download_starts_by_reset_program() {
-    let raw = throughput::program(20);
+    let raw = throughput::program(24);
     let hex = intel_hex(firmware::board().programs[0].base, &raw).into_bytes();
     for (data, transfers) in [
         (&raw, Transfers::Segments),
@@ -69,7 +69,7 @@ fn a_program_in_one_download_starts_by_reset_program() {
 /// The same with NMT reset node directly after the last segment.
 #[test]
 fn a_reset_right_behind_the_download_does_not_lose_it() {
-    let raw = throughput::program(20);
+    let raw = throughput::program(24);
     let mut bench = board_at_1_mbit(Options::default());
     write(&mut bench, CONTROL, &[CLEAR], Transfers::Blocks);
     write(&mut bench, DATA, &raw, Transfers::Blocks);
@@ -122,7 +122,7 @@ fn never_silent_while_the_flash_is_slower_than_the_bus() {
 fn reset_program_starts_the_application_anew() {
     let mut bench = board_at_1_mbit(Options::default());
     write(&mut bench, CONTROL, &[CLEAR], Transfers::Blocks);
-    write(&mut bench, DATA, &throughput::program(20), Transfers::Blocks);
+    write(&mut bench, DATA, &throughput::program(24), Transfers::Blocks);
     write(&mut bench, CONTROL, &[RESET], Transfers::Blocks);
     bench.await_boot_up(2000);
     write(&mut bench, CONTROL, &[RESET], Transfers::Blocks);
