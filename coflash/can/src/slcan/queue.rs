@@ -16,8 +16,8 @@ const MOST_UNDER_WAY: usize = 32;
 const AT_ONCE: usize = 2;
 /// How long an answer is waited for before more frames are sent.
 const LEAD: Duration = Duration::from_micros(250);
-/// The pauses before a refused frame is sent again: each is twice as long as the last one.
-pub(super) const PAUSES: [Duration; 2] = [Duration::from_micros(200), Duration::from_millis(4)];
+/// The shortest pause before a refused frame is sent again.
+const PAUSE: Duration = Duration::from_micros(200);
 /// The bits of a frame with an identifier of 11 bits and 8 bytes, without stuff bits (ISO 11898-1).
 const FRAME_BITS: u64 = 111;
 /// The frames that a queue without answers is taken to have; a shorter one than this gets one at a time.
@@ -53,6 +53,10 @@ pub(super) struct Sending {
     pub(super) refusal: Option<Refusal>,
     /// How many frames the queue has, once it was full.
     capacity: Option<u32>,
+    /// The frames that it has taken since the queue was empty, or since it was full, and since when.
+    took: u32,
+    since: Instant,
+    was_full: bool,
     /// How long a frame takes on the bus: at least, and as estimated; 0 if the bit rate is unknown.
     shortest: Duration,
     frame_time: Duration,
@@ -72,6 +76,9 @@ impl Sending {
             refused: VecDeque::new(),
             refusal: None,
             capacity: None,
+            took: 0,
+            since: now,
+            was_full: false,
             shortest: Duration::ZERO,
             frame_time: Duration::ZERO,
             empty: now,
@@ -113,8 +120,10 @@ impl Sending {
         let Some(capacity) = self.capacity else {
             return Some(if under_way < AT_ONCE { self.waits } else { self.waits + LEAD });
         };
-        // A quarter of a longer queue stays free, for what the estimate does not know.
-        let before = self.frame_time * (capacity - capacity / 4 - 1);
+        // A part of the queue stays free, for what the estimate does not know: more of it while others are
+        // under way, which a refused frame would come after.
+        let free = if under_way > 0 { capacity.div_ceil(2) } else { capacity / 4 };
+        let before = self.frame_time * (capacity - free).saturating_sub(1);
         let queued = self.empty.checked_sub(before).unwrap_or(self.waits);
         let is_short = capacity < SHORT_QUEUE && under_way > 0;
         Some(if is_short { queued.max(self.waits + LEAD.max(self.frame_time)) } else { queued })
@@ -122,6 +131,9 @@ impl Sending {
 
     /// A frame is sent now.
     pub(super) fn sends(&mut self, frame: Frame, now: Instant) {
+        if self.empty <= now && self.under_way.is_empty() {
+            (self.took, self.was_full) = (0, false);
+        }
         self.empty = self.empty.max(now) + self.frame_time;
         if self.answers != Answers::Never {
             self.waits = if self.under_way.is_empty() { now } else { self.waits };
@@ -136,39 +148,48 @@ impl Sending {
             return;
         }
         self.answers = Answers::Each;
+        if self.took == 0 && !self.was_full {
+            self.since = now;
+        }
+        self.took += 1;
         // What has slowed the bus down may be over.
         self.frame_time -= (self.frame_time - self.shortest) / 256;
         if let Some(refusal) = self.refusal.take() {
             self.losses.restarts += u32::from(refusal.reopened == Some(true));
-            self.is_full(now);
+            self.pause(now);
         }
     }
 
-    /// The adapter has refused a frame.
+    /// The adapter has refused a frame: its queue is full.
     pub(super) fn refuses(&mut self, now: Instant) {
         self.losses.refused = self.losses.refused.saturating_add(1);
         self.waits = now;
         let Some(frame) = self.under_way.pop_front() else { return };
         self.answers = Answers::Each;
         self.refused.push_back(frame);
-        if self.refusal.is_none() && self.capacity.is_some() {
-            // The frames of others, and stuff bits, take time, too.
-            self.frame_time = (self.frame_time + self.frame_time / 8).min(4 * self.shortest);
+        let elapsed = now - self.since;
+        let filled = if self.was_full { 0 } else { self.capacity.unwrap_or(self.took) };
+        if let Some(sent @ 1..) = self.took.checked_sub(filled) {
+            // Those of others, and stuff bits, take time, too.
+            let measured = (elapsed / sent).clamp(self.shortest, 4 * self.shortest);
+            self.frame_time = measured.min(self.frame_time + self.frame_time / 16);
         }
-        let left = self.empty.saturating_duration_since(now).as_nanos();
-        let queued = (left / self.frame_time.as_nanos().max(1)) as u32;
-        let queued = queued.saturating_sub(1 + self.under_way.len() as u32).max(1);
-        self.capacity = self.capacity.max(Some(queued));
-        self.is_full(now);
+        if !self.was_full {
+            let sent = (elapsed.as_nanos() / self.shortest.as_nanos().max(1)) as u32;
+            self.capacity = self.capacity.max(Some(self.took.saturating_sub(sent).max(1)));
+        }
+        (self.took, self.since, self.was_full) = (0, now, true);
+        self.empty = now + self.frame_time * self.capacity.unwrap_or_default();
+        self.pause(now);
     }
 
-    /// The queue is full at this time; what was refused is sent again after a pause.
-    fn is_full(&mut self, now: Instant) {
-        self.empty = now + self.frame_time * self.capacity.unwrap_or_default();
-        let [pause, _] = PAUSES;
-        let first = Refusal { paused: Duration::ZERO, pause, next: now, reopened: None };
+    /// What was refused is sent again when there is room for one frame, and after longer and longer pauses.
+    fn pause(&mut self, now: Instant) {
         if !self.refused.is_empty() {
+            let none = Duration::ZERO;
+            let first = Refusal { paused: none, pause: none, next: now, reopened: None };
             let refusal = self.refusal.get_or_insert(first);
+            refusal.pause = PAUSE.max(self.frame_time).max(refusal.paused / 2);
             refusal.next = now + refusal.pause;
         }
     }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use canopen::Frame;
 
 use super::opening::{Answer, Heard, REST};
-use super::queue::{Answers, Refusal, PAUSES};
+use super::queue::{Answers, Refusal};
 use super::{is_of_protocol, parse_frame, text_of, Line, Message, Slcan, ANSWER, MOST_EARLY};
 use crate::adapter::AdapterError;
 use crate::health::Health;
@@ -120,7 +120,6 @@ impl<L: Line> Slcan<L> {
     /// Sends the first of the refused frames again.
     fn repeat(&mut self, mut refusal: Refusal) -> Result<(), AdapterError> {
         refusal.paused += refusal.pause;
-        refusal.pause = PAUSES[1].min(2 * refusal.pause);
         if refusal.reopened.is_none() && refusal.paused >= CLOSED {
             refusal.reopened = Some(self.reopen()? == Answer::Done);
         } else if refusal.paused >= STUCK {

@@ -95,11 +95,22 @@ struct Queue {
     frame: Duration,
     ends: VecDeque<Duration>,
     bus: Vec<String>,
+    /// Frames of other nodes take the bus: how often, and for how long.
+    others: (Duration, Duration),
 }
 
 impl Queue {
     fn new(size: usize, frame: Duration) -> Self {
-        Self { open: false, size, frame, ends: VecDeque::new(), bus: Vec::new() }
+        let others = (ms(1), ms(0));
+        Self { open: false, size, frame, ends: VecDeque::new(), bus: Vec::new(), others }
+    }
+
+    /// When a frame is through that follows those in the queue.
+    fn end(&self, at: Duration) -> Duration {
+        let begin = self.ends.back().map_or(at, |end| at.max(*end));
+        let (period, taken) = self.others;
+        let since = Duration::from_nanos((begin.as_nanos() % period.as_nanos()) as u64);
+        begin + taken.saturating_sub(since) + self.frame
     }
 
     fn answer(&mut self, line: &str, at: Duration) -> String {
@@ -107,7 +118,7 @@ impl Queue {
         self.ends.retain(|end| *end > at);
         match line.chars().next() {
             Some('t') if self.open && self.ends.len() < self.size => {
-                self.ends.push_back(self.ends.back().map_or(at, |end| *end) + self.frame);
+                self.ends.push_back(self.end(at));
                 self.bus.push(line.to_string());
                 return "z\r".to_string();
             }
@@ -559,9 +570,9 @@ fn an_echo_is_no_frame_of_the_bus() {
     assert_eq!(bus.receive(ms(20)).unwrap(), None);
 }
 
-/// Sends sub-blocks of an SDO block download; returns what has reached the bus, the time, and what was refused.
-fn sub_blocks(size: usize, rate: u32, latency: u64, baud: u32) -> (Vec<String>, Duration, u32) {
-    let mut device = Device::queue(size, Duration::from_secs(125) / rate);
+/// Sends sub-blocks of an SDO block download; returns what has reached the bus, the time, and the frames sent.
+fn sub_blocks(queue: Queue, rate: u32, latency: u64, baud: u32) -> (Vec<String>, Duration, u32) {
+    let mut device = Device { queue: Some(queue), ..Device::new(nothing) };
     (device.latency, device.byte) = (Duration::from_micros(latency), Duration::from_secs(10) / baud);
     let mut bus = open(&mut device, Some(rate)).unwrap();
     let begun = bus.line.now;
@@ -580,7 +591,8 @@ fn sub_blocks(size: usize, rate: u32, latency: u64, baud: u32) -> (Vec<String>, 
     (device.queue.unwrap().bus, time, refused)
 }
 
-/// What fits into the queue while an answer is on the way (USB takes 1 ms, some converters 16 ms) keeps the bus busy.
+/// What fits into the queue while an answer is on the way (USB takes 1 ms, some converters 16 ms) keeps the bus
+/// busy, also where other nodes take it for some ms of each period.
 #[test]
 fn a_refused_frame_is_sent_again_in_its_order() {
     let sent: Vec<String> = (0..8 * 127).map(|segment| format!("t6058{segment:04X}020304050607")).collect();
@@ -594,19 +606,28 @@ fn a_refused_frame_is_sent_again_in_its_order() {
         (125_000, 1_000, 115_200, 3),
         (125_000, 1_000, 57_600, 3),
     ] {
-        let (all, free, none) = sub_blocks(10_000, rate, latency, baud);
-        assert_eq!((&all, none), (&sent, 0));
-        for size in [3, 16, 64].into_iter().filter(|size| *size >= shortest) {
-            let (mut bus, time, refused) = sub_blocks(size, rate, latency, baud);
-            // A frame that was on its way when the one before was refused.
-            let late = bus.iter().zip(&sent).filter(|(there, sent)| there != sent).count();
-            let at = format!(
-                "{size} frames, {rate} bit/s, {latency} us, {baud} baud: {refused} refused, {late} late"
-            );
-            assert!(time.as_secs_f64() <= 1.3 * free.as_secs_f64(), "{at}: {time:?}, not {free:?}");
-            assert!(refused <= sent.len() as u32 / 20 && late <= 30, "{at}");
-            bus.sort();
-            assert_eq!(bus, sent, "{at}");
+        for others in [(100, 0), (20, 4), (100, 10), (100, 30), (300, 30)] {
+            let queue = |size| Queue {
+                others: (ms(others.0), ms(others.1)),
+                ..Queue::new(size, Duration::from_secs(125) / rate)
+            };
+            let (all, free, none) = sub_blocks(queue(10_000), rate, latency, baud);
+            assert_eq!((&all, none), (&sent, 0));
+            for size in [3, 16, 64].into_iter().filter(|size| *size >= shortest) {
+                let (mut bus, time, refused) = sub_blocks(queue(size), rate, latency, baud);
+                // In these sub-blocks a frame was on its way when the one before was refused.
+                let late =
+                    bus.chunks(127).zip(sent.chunks(127)).filter(|(there, sent)| there != sent).count();
+                let ratio = time.as_secs_f64() / free.as_secs_f64();
+                let at = format!("{size} frames, {rate} bit/s, {latency} us, {baud} baud, others {others:?}");
+                let at = format!("{at}: {refused} refused, {late} late, {ratio:.2} of the time");
+                // What a slow line cannot send meanwhile is lost.
+                assert!(ratio <= if baud < 1_000_000 { 1.5 } else { 1.3 }, "{at}");
+                let (part, most) = if others.1 == 0 { (20, 4) } else { (4, 8) };
+                assert!(refused <= sent.len() as u32 / part && late <= most, "{at}");
+                bus.sort();
+                assert_eq!(bus, sent, "{at}");
+            }
         }
     }
 }
