@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use super::health::Controller;
+
 /// The ways to find adapters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
@@ -44,6 +46,33 @@ impl fmt::Display for Kind {
     }
 }
 
+/// The unusual state of an adapter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// A CAN interface that is switched off.
+    Off,
+    /// The state of its controller.
+    Controller(Controller),
+    /// Another program uses it.
+    InUse,
+    /// PCAN-View uses it, too.
+    Shared,
+    /// The kernel uses it, as a CAN interface.
+    Kernel,
+}
+
+impl fmt::Display for State {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Off => "switched off",
+            Self::Controller(controller) => controller.words(),
+            Self::InUse => "used by another program",
+            Self::Shared => "shared with PCAN-View",
+            Self::Kernel => "the kernel uses it: see socketcan",
+        })
+    }
+}
+
 /// An adapter that was found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -55,7 +84,7 @@ pub struct Found {
     /// The adapter's own name or description.
     pub about: String,
     /// Its state, if it is unusual.
-    pub state: Option<String>,
+    pub state: Option<State>,
     /// The bit rate in bit/s that is already set, if it is known.
     pub bit_rate: Option<u32>,
     /// Whether the adapter certainly leads to a CAN bus, so that it can be used without the user

@@ -3,6 +3,8 @@
 
 use std::fmt;
 
+use serde::Serialize;
+
 /// The state of a CAN controller (fault confinement, ISO 11898-1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Controller {
@@ -58,7 +60,7 @@ pub struct Health {
 }
 
 /// What did not go through an adapter since it was opened. `Display` has what a user should know.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Losses {
     /// Frames that it refused; they were sent again in their order, if it answers each frame.
     pub refused: u32,

@@ -43,7 +43,7 @@ mod trace;
 
 pub use self::adapter::{Adapter, AdapterError, Obstacle, URLS};
 pub use self::cia309::Cia309;
-pub use self::found::{Found, Kind, Missing};
+pub use self::found::{Found, Kind, Missing, State};
 pub use self::gateway::{Gateway, GatewayError};
 pub use self::health::{Health, Losses};
 pub use self::link::Link;

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::found::{shown, Found, Kind, Missing};
+use super::found::{shown, Found, Kind, Missing, State};
 use super::health::{Controller, Health};
 use super::in_time::in_time;
 
@@ -107,11 +107,8 @@ fn link(link: &Value) -> Option<Link> {
 /// The CAN interfaces as adapters.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let found = all()?.into_iter().map(|link| {
-        let state = match link.health.controller {
-            _ if !link.up => Some("switched off".to_string()),
-            Some(controller) => Some(controller.words().to_string()),
-            None => None,
-        };
+        let controller = link.health.controller.map(State::Controller);
+        let state = if link.up { controller } else { Some(State::Off) };
         let about = shown(format!("CAN interface of the kernel ({})", link.kind).as_bytes());
         let found = Found::new(Kind::SocketCan, format!("socketcan:{}", shown(link.name.as_bytes())), about);
         // A user has created this interface for a purpose, even if it is virtual.

@@ -12,7 +12,7 @@ use vendor_can::pcan::{Message, Pcan};
 
 use super::adapter::{AdapterError, Obstacle, ABSENT};
 use super::driven::{frame_of, Driven, Driver, Fault, Sent};
-use super::found::{shown, Found, Kind, Missing};
+use super::found::{shown, Found, Kind, Missing, State};
 use super::health::{Controller, Health};
 
 /// Where to get the library.
@@ -144,16 +144,13 @@ pub(super) fn list() -> Result<Vec<Found>, Missing> {
         // Available 1, occupied 2, used by PCAN-View and available 3.
         let state = match (status, condition) {
             (0, 1) => None,
-            (0, 2) => Some("used by another program"),
-            (0, 3) => Some("shared with PCAN-View"),
+            (0, 2) => Some(State::InUse),
+            (0, 3) => Some(State::Shared),
             _ => return None,
         };
         let (status, hardware) = library.text(channel, parameter::HARDWARE_NAME);
         let about = if status == 0 { shown(&hardware) } else { String::new() };
-        Some(Found {
-            state: state.map(str::to_string),
-            ..Found::new(Kind::Peak, format!("peak:{name}"), about)
-        })
+        Some(Found { state, ..Found::new(Kind::Peak, format!("peak:{name}"), about) })
     });
     Ok(found.collect())
 }

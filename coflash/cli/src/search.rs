@@ -67,7 +67,11 @@ impl fmt::Display for Line<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Found { url, about, state, bit_rate, .. } = self.0;
         let rate = bit_rate.map(|rate| format!("{} kbit/s", f64::from(rate) / 1000.0));
-        let words = [Some(about.clone()).filter(|about| !about.is_empty()), rate, state.clone()];
+        let words = [
+            Some(about.clone()).filter(|about| !about.is_empty()),
+            rate,
+            state.map(|state| state.to_string()),
+        ];
         let words: Vec<String> = words.into_iter().flatten().collect();
         match words.as_slice() {
             [] => f.write_str(url),

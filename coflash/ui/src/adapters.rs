@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use coboot_can::{Found, Kind};
+use coboot_can::{Found, Kind, State};
 
 /// An adapter.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -19,7 +19,7 @@ pub(super) struct Listed {
     /// What it calls itself; nothing where that would only be its kind.
     product: Option<String>,
     /// The key of its state, if it is unusual; English for one without a key.
-    state: Option<String>,
+    state: Option<&'static str>,
 }
 
 /// The adapters of these kinds, except servers on the network: their beacons take up to 3 s, and
@@ -45,12 +45,12 @@ fn listed(Found { kind, url, about, state, .. }: Found) -> Listed {
         kind: key,
         name,
         product: Some(about).filter(|about| kind != Kind::SocketCan && about != "serial port"),
-        state: state.map(|state| match &*state {
-            "switched off" => "port-off".to_owned(),
-            "used by another program" => "port-used".to_owned(),
-            "shared with PCAN-View" => "port-shared".to_owned(),
-            "the kernel uses it: see socketcan" => "port-kernel".to_owned(),
-            _ => state,
+        state: state.map(|state| match state {
+            State::Off => "port-off",
+            State::InUse => "port-used",
+            State::Shared => "port-shared",
+            State::Kernel => "port-kernel",
+            State::Controller(controller) => controller.words(),
         }),
     }
 }

@@ -5,7 +5,7 @@ use super::usb;
 use super::which::{Choice, Which};
 use crate::adapter::{AdapterError, Obstacle};
 use crate::driven::Driven;
-use crate::found::{shown, Found, Kind, Missing};
+use crate::found::{shown, Found, Kind, Missing, State};
 
 /// Checks what names a device. It tells its bit rates when it is open.
 pub(crate) fn check(which: &str, _: Option<u32>) -> Result<(), &'static str> {
@@ -51,10 +51,7 @@ pub(crate) fn list() -> Result<Vec<Found>, Missing> {
         let about = shown(device.product.as_deref().unwrap_or("USB adapter").as_bytes());
         let found = Found::new(Kind::GsUsb, format!("gs_usb:{}", shown(which.as_bytes())), about);
         match device.kernel {
-            true => {
-                let state = Some("the kernel uses it: see socketcan".to_string());
-                Found { state, certain: false, ..found }
-            }
+            true => Found { state: Some(State::Kernel), certain: false, ..found },
             false => found,
         }
     });

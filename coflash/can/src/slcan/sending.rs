@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use canopen::Frame;
 
 use super::opening::{Answer, Heard, REST};
-use super::queue::{Answers, Refusal};
+use super::queue::{Answers, Refusal, LATE_ANSWER};
 use super::{is_of_protocol, parse_frame, text_of, Line, Message, Slcan, ANSWER, MOST_EARLY};
 use crate::adapter::AdapterError;
 use crate::health::Health;
@@ -104,12 +104,14 @@ impl<L: Line> Slcan<L> {
             }
             return Ok(());
         }
-        if self.sending.is_suspect && now >= self.heard + REST {
+        // One that acknowledges nothing may say anything: it has restarted if its bus is silent from then on.
+        let (patience, restarted) = match self.sending.answers {
+            Answers::Never => (LATE_ANSWER, Answer::None),
+            Answers::Unknown | Answers::Each => (REST, Answer::Done),
+        };
+        if self.sending.is_suspect && now >= self.heard + patience {
             self.sending.is_suspect = false;
-            let is_silent = self.sending.answers == Answers::Never;
-            let answer = self.reopen()?;
-            let has_restarted = answer == Answer::Done || is_silent && answer == Answer::None;
-            self.sending.losses.restarts += u32::from(has_restarted);
+            self.sending.losses.restarts += u32::from(self.reopen()? == restarted);
         }
         match self.sending.refusal {
             Some(refusal) if is_due(self) => self.repeat(refusal),

@@ -1,6 +1,7 @@
 //! The protocol's messages, and the adapters and other devices that are found at a serial port.
 
 use std::collections::VecDeque;
+use std::sync::LazyLock;
 
 use proptest::prelude::*;
 
@@ -57,12 +58,15 @@ fn messages_are_those_of_the_protocol() {
 /// The answer of a device to a line; the number counts the lines.
 type Answers = fn(line: &str, number: usize) -> String;
 
+/// When virtual time begins.
+static EPOCH: LazyLock<Instant> = LazyLock::new(Instant::now);
+
 /// A device at the other end of a line, in virtual time.
+#[derive(Default)]
 struct Device {
-    epoch: Instant,
     now: Duration,
     timeout: Duration,
-    answers: Answers,
+    answers: Option<Answers>,
     /// How long an answer takes.
     latency: Duration,
     /// It answers one command after the other: when the last answer came.
@@ -138,25 +142,7 @@ const fn ms(ms: u64) -> Duration {
 
 impl Device {
     fn new(answers: Answers) -> Self {
-        Self {
-            epoch: Instant::now(),
-            now: Duration::ZERO,
-            timeout: Duration::ZERO,
-            answers,
-            latency: ms(1),
-            busy: None,
-            starts: Duration::ZERO,
-            says: b"",
-            period: None,
-            next: Duration::ZERO,
-            coming: VecDeque::new(),
-            line: String::new(),
-            lines: Vec::new(),
-            gone: false,
-            byte: Duration::ZERO,
-            arrived: Duration::ZERO,
-            queue: None,
-        }
+        Self { answers: Some(answers), latency: ms(1), ..Self::default() }
     }
 
     fn queue(size: usize, frame: Duration) -> Self {
@@ -180,6 +166,11 @@ impl Device {
     /// It sends this by itself, each time after so many milliseconds.
     fn talks(answers: Answers, says: &'static [u8], first: u64, period: u64) -> Self {
         Self { says, next: ms(first), period: Some(ms(period)), ..Self::new(answers) }
+    }
+
+    /// It sends this, in so many milliseconds.
+    fn sends(&mut self, text: &str, after: u64) {
+        self.coming.extend(text.bytes().map(|byte| (self.now + ms(after), byte)));
     }
 
     /// Puts what it says by itself until `end` behind what is on its way.
@@ -232,7 +223,7 @@ impl Write for Device {
             let line = std::mem::take(&mut self.line);
             let answer = match &mut self.queue {
                 Some(queue) => queue.answer(&line, self.arrived),
-                None => (self.answers)(&line, self.lines.len()),
+                None => self.answers.map_or(String::new(), |answers| answers(&line, self.lines.len())),
             };
             let at = self.busy.map_or(self.arrived, |busy| busy.max(self.arrived)) + self.latency;
             self.busy = self.busy.map(|_| at);
@@ -254,7 +245,7 @@ impl Line for &mut Device {
     }
 
     fn now(&self) -> Instant {
-        self.epoch + self.now
+        *EPOCH + self.now
     }
 }
 
@@ -537,9 +528,8 @@ fn the_status_flags_tell_the_controllers_state() {
     ] {
         let mut device = Device::new(lawicel);
         let mut bus = open(&mut device, None).unwrap();
-        let now = bus.line.now;
-        bus.line.coming.extend(answer.bytes().map(|byte| (now, byte)));
-        bus.line.answers = nothing;
+        bus.line.sends(answer, 0);
+        bus.line.answers = None;
         assert_eq!(bus.health().and_then(|health| health.controller), controller, "{answer:?}");
         // A frame that arrives meanwhile is not lost.
         assert_eq!(bus.receive(Duration::ZERO).unwrap().is_some(), answer.starts_with('t'));
@@ -561,11 +551,10 @@ fn an_echo_is_no_frame_of_the_bus() {
     let mut bus = open(&mut device, None).unwrap();
     bus.send(&frame(0x605, &[0x40])).unwrap();
     bus.send(&frame(0x605, &[0x60])).unwrap();
-    let later = bus.line.now + ms(2);
-    bus.line.coming.extend(b"t5851FF\r".iter().map(|byte| (later, *byte)));
+    bus.line.sends("t5851FF\r", 2);
     assert_eq!(bus.receive(ms(20)).unwrap(), Some(frame(0x585, &[0xFF])));
     // Another tool sends the same.
-    bus.line.coming.extend(b"t605140\r".iter().map(|byte| (later, *byte)));
+    bus.line.sends("t605140\r", 0);
     assert_eq!(bus.receive(ms(20)).unwrap(), Some(frame(0x605, &[0x40])));
     assert_eq!(bus.receive(ms(20)).unwrap(), None);
 }
@@ -640,9 +629,9 @@ fn an_adapter_that_has_restarted_is_opened_again() {
         let mut bus = open(&mut device, Some(125_000)).unwrap();
         bus.send(&frame(0x605, &[0x40])).unwrap();
         assert_eq!((bus.receive(ms(20)).unwrap(), bus.losses()), (None, Losses::default()));
-        let (now, lines) = (bus.line.now, bus.line.lines.len());
+        let lines = bus.line.lines.len();
         bus.line.queue.as_mut().unwrap().open = false;
-        bus.line.coming.extend(text.bytes().map(|byte| (now, byte)));
+        bus.line.sends(text, 0);
         assert_eq!(bus.receive(ms(100)).unwrap(), None);
         bus.send(&frame(0x605, &[0x60])).unwrap();
         assert_eq!(bus.receive(ms(500)).unwrap(), None);
@@ -655,13 +644,16 @@ fn an_adapter_that_has_restarted_is_opened_again() {
         assert!(again.iter().any(|line| line == "S4"), "{again:?}");
         assert_eq!(device.queue.unwrap().bus, ["t605140", "t605160"], "{text:?}");
     }
-    // One that acknowledges nothing.
+    // One that acknowledges nothing may say anything: it has restarted if no frame follows.
     let mut device = Device::new(quiet);
     let mut bus = open(&mut device, Some(125_000)).unwrap();
-    let now = bus.line.now;
-    bus.line.coming.extend(b"USB CAN v1\r".iter().map(|byte| (now, *byte)));
-    assert_eq!(bus.receive(ms(200)).unwrap(), None);
-    assert_eq!(bus.losses().restarts, 1);
+    for (text, restarts) in
+        [("tx done\rt70517F\r", 0), ("USB CAN v1\r", 0), ("\rt70517F\r", 0), ("USB CAN v1\r", 1)]
+    {
+        bus.line.sends(text, 0);
+        while bus.receive(ms(200 + 1_000 * restarts)).unwrap().is_some() {}
+        assert_eq!(u64::from(bus.losses().restarts), restarts, "{text}");
+    }
     // Its frames need no answers. It drops what does not fit into its queue: they come as the bus takes them.
     let now = bus.line.now;
     for _ in 0..500 {
@@ -726,7 +718,7 @@ fn an_adapter_that_becomes_something_else_is_told() {
             0,
             "acknowledgements are of the protocol"
         );
-        bus.line.answers = answers;
+        bus.line.answers = Some(answers);
         for _ in 0..3 {
             bus.send(&frame(0x605, &[0x40])).unwrap();
             assert_eq!(bus.receive(ms(20)).unwrap(), None);
@@ -745,9 +737,7 @@ fn a_line_that_is_too_long_is_skipped_and_the_session_goes_on() {
     let long = |len| "t70517F".repeat(len);
     // As long as a CAN FD frame; longer than any buffer; a frame may follow in the same line's end.
     for line in [long(10), long(5000), format!("d0058{}", "00".repeat(64)), "x\x07".repeat(100)] {
-        let now = bus.line.now;
-        let text = format!("{line}\rt70517F\r");
-        bus.line.coming.extend(text.bytes().map(|byte| (now, byte)));
+        bus.line.sends(&format!("{line}\rt70517F\r"), 0);
         assert_eq!(bus.receive(ms(100)).unwrap(), Some(frame(0x705, &[0x7F])), "{}", line.len());
         assert_eq!(bus.receive(ms(100)).unwrap(), None, "{}", line.len());
     }

@@ -98,59 +98,88 @@ fn a_url_that_names_no_slcan_adapter_is_explained() {
     }
 }
 
-/// The serial port is one end of a pseudo-terminal.
-#[cfg(unix)]
+/// The serial port is one end of a pseudo-terminal; the adapter at its other end has a UART with one speed.
+#[cfg(target_os = "linux")]
 #[test]
 fn slcan_over_a_serial_port() {
-    use serialport::{SerialPort, TTYPort};
-    let (mut master, slave) = TTYPort::pair().unwrap();
-    let name = slave.name().unwrap();
-    master.set_timeout(Duration::from_millis(1)).unwrap();
-    let done = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
-    let over = done.clone();
-    let server = thread::spawn(move || {
-        let mut said = Vec::new();
-        let fake = converse(
-            Until(master, over),
-            device(),
-            |text, stream| slcan(text, stream, &mut said),
-            slcan_text,
-        );
-        (fake, said)
-    });
-    let file = data("identity-110.blk");
-    // The bit rate comes from the manual's option, because the URL contains none.
-    let flashed = coflash(&["--bus", &format!("slcan:{name}"), "flash", "-N", "5", "-B", "4", &file]);
-    done.store(true, std::sync::atomic::Ordering::Relaxed);
-    let (fake, said) = server.join().unwrap();
-    drop(slave);
-    assert_eq!(flashed.exit, 0, "{}{}", flashed.out, flashed.err);
-    check(&fake);
-    assert_eq!(said[1..5], ["C", "V", "S4", "O"]);
-}
-
-/// A line that ends on request: a pseudo-terminal does not notice that its other end was closed.
-#[cfg(unix)]
-struct Until<L>(L, std::sync::Arc<std::sync::atomic::AtomicBool>);
-
-#[cfg(unix)]
-impl<L: Read> Read for Until<L> {
-    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
-        if self.1.load(std::sync::atomic::Ordering::Relaxed) {
-            return Ok(0);
+    use serialport::SerialPort;
+    for (query, speed, is_right) in [
+        ("", 115_200, true),
+        ("?baud=57600", 57_600, true),
+        ("?baud=1M", 1_000_000, true),
+        ("?baud=3M", 3_000_000, true),
+        ("", 57_600, false),
+    ] {
+        let (mut port, slave) = serialport::TTYPort::pair().unwrap();
+        port.set_timeout(Duration::from_millis(1)).unwrap();
+        let bus = format!("slcan:{}{query}", slave.name().unwrap());
+        let over = std::sync::Arc::<std::sync::atomic::AtomicBool>::default();
+        let uart = Uart { port, speed, over: over.clone() };
+        let server = thread::spawn(move || {
+            let mut said = Vec::new();
+            let fake = converse(uart, device(), |text, stream| slcan(text, stream, &mut said), slcan_text);
+            (fake, said)
+        });
+        // The bit rate comes from the manual's option, because the URL contains none.
+        let flashed = coflash(&["--bus", &bus, "flash", "-N", "5", "-B", "4", &data("identity-110.blk")]);
+        over.store(true, std::sync::atomic::Ordering::Relaxed);
+        let (fake, said) = server.join().unwrap();
+        drop(slave);
+        if !is_right {
+            assert!(said.is_empty(), "{said:?}");
+            flashed.fails(4, &["at 115200 bit/s as an adapter does", "append, for example, ?baud=57600"]);
+            continue;
         }
-        self.0.read(bytes)
+        assert_eq!(flashed.exit, 0, "{bus}: {}{}", flashed.out, flashed.err);
+        check(&fake);
+        assert_eq!(said[1..5], ["C", "V", "S4", "O"], "{bus}");
     }
 }
 
-#[cfg(unix)]
-impl<L: Write> Write for Until<L> {
+/// A UART in front of the adapter. Bytes take their time, at the speed that the tool has set; if it is another
+/// one than the adapter's, they are noise. It ends on request: a pseudo-terminal does not notice that its other
+/// end was closed.
+#[cfg(target_os = "linux")]
+struct Uart {
+    port: serialport::TTYPort,
+    speed: u32,
+    over: std::sync::Arc<std::sync::atomic::AtomicBool>,
+}
+
+#[cfg(target_os = "linux")]
+impl Uart {
+    /// The bytes (start bit, eight data bits, stop bit) as they arrive.
+    fn carry(&self, bytes: &mut [u8]) {
+        let set = serialport::SerialPort::baud_rate(&self.port).unwrap();
+        thread::sleep(Duration::from_secs(10 * bytes.len() as u64) / set);
+        if set != self.speed {
+            bytes.fill(0xFF);
+        }
+    }
+}
+
+#[cfg(target_os = "linux")]
+impl Read for Uart {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        if self.over.load(std::sync::atomic::Ordering::Relaxed) {
+            return Ok(0);
+        }
+        let len = self.port.read(bytes)?;
+        self.carry(&mut bytes[..len]);
+        Ok(len)
+    }
+}
+
+#[cfg(target_os = "linux")]
+impl Write for Uart {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.write(bytes)
+        let mut bytes = bytes.to_vec();
+        self.carry(&mut bytes);
+        self.port.write(&bytes)
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
-        self.0.flush()
+        self.port.flush()
     }
 }
 

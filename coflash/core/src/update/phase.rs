@@ -188,13 +188,8 @@ pub enum Warning {
     },
     /// The device has not answered for a while, and the tool waits for it.
     Silent(Silence),
-    /// The adapter has refused frames, or has restarted.
-    Adapter {
-        /// The frames that it refused.
-        refused: u32,
-        /// Its restarts.
-        restarts: u32,
-    },
+    /// What did not go through the adapter.
+    Adapter(Losses),
 }
 
 impl fmt::Display for Phase {
@@ -294,9 +289,7 @@ impl fmt::Display for Warning {
             }
             Self::CoversStaging { first } => file::Note::CoversStaging(*first).fmt(f),
             Self::Silent(silence) => silence.fmt(f),
-            Self::Adapter { refused, restarts } => {
-                Losses { refused: *refused, restarts: *restarts, lost: 0 }.fmt(f)
-            }
+            Self::Adapter(losses) => losses.fmt(f),
         }
     }
 }

@@ -71,9 +71,9 @@ pub(super) fn flash_knowing(
         if let DeviceAnswer::Given(_) = left.answer {
             update.known.state = left.state;
         }
-        let Losses { refused, restarts, .. } = session.losses().since(before);
-        if refused > 0 || restarts > 0 {
-            update.report(Warning::Adapter { refused, restarts }.into());
+        let losses = session.losses().since(before);
+        if losses != Losses::default() {
+            update.report(Warning::Adapter(losses).into());
         }
         update.report(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::{file, node};
 use canopen::{AbortCode, NodeId};
+use coboot_can::Losses;
 use coflash_core::device::session::Silence;
 use coflash_core::device::{DeviceType, Dialect, Doing, Session, Timing};
 use coflash_core::file::checksum::Checksum;
@@ -173,8 +174,8 @@ fn the_names_stay() {
         (
             "warning",
             "adapter",
-            Warning::Adapter { refused: 9, restarts: 1 }.into(),
-            json!({ "refused": 9, "restarts": 1 }),
+            Warning::Adapter(Losses { refused: 9, lost: 2, restarts: 1 }).into(),
+            json!({ "refused": 9, "lost": 2, "restarts": 1 }),
         ),
     ];
     for (kind, name, event, data) in cases {
