@@ -83,6 +83,28 @@ pub enum Delivery {
     Disturbed,
 }
 
+/// What an adapter has of the one that it is in front of.
+macro_rules! passes_on {
+    ($this:ident => $inner:expr) => {
+        fn now(&self) -> Duration {
+            let $this = self;
+            $inner.now()
+        }
+
+        fn health(&mut self) -> Option<Health> {
+            let $this = self;
+            $inner.health()
+        }
+
+        fn losses(&self) -> Losses {
+            let $this = self;
+            $inner.losses()
+        }
+    };
+}
+
+pub(super) use passes_on;
+
 /// An adapter by a pointer to it.
 macro_rules! by_pointer {
     ($($pointer:ty),*) => {$(
@@ -95,17 +117,7 @@ macro_rules! by_pointer {
                 (**self).receive(timeout)
             }
 
-            fn now(&self) -> Duration {
-                (**self).now()
-            }
-
-            fn health(&mut self) -> Option<Health> {
-                (**self).health()
-            }
-
-            fn losses(&self) -> Losses {
-                (**self).losses()
-            }
+            passes_on!(this => (**this));
 
             fn group(&mut self) -> Option<&mut dyn Group> {
                 (**self).group()

@@ -49,8 +49,6 @@ impl fmt::Display for Kind {
 /// The unusual state of an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// A CAN interface that is switched off.
-    Off,
     /// The state of its controller.
     Controller(Controller),
     /// Another program uses it.
@@ -61,15 +59,16 @@ pub enum State {
     Kernel,
 }
 
-impl fmt::Display for State {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Off => "switched off",
+impl State {
+    /// It in messages.
+    #[must_use]
+    pub const fn words(self) -> &'static str {
+        match self {
             Self::Controller(controller) => controller.words(),
             Self::InUse => "used by another program",
             Self::Shared => "shared with PCAN-View",
             Self::Kernel => "the kernel uses it: see socketcan",
-        })
+        }
     }
 }
 

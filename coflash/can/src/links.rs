@@ -107,8 +107,8 @@ fn link(link: &Value) -> Option<Link> {
 /// The CAN interfaces as adapters.
 pub(super) fn list() -> Result<Vec<Found>, Missing> {
     let found = all()?.into_iter().map(|link| {
-        let controller = link.health.controller.map(State::Controller);
-        let state = if link.up { controller } else { Some(State::Off) };
+        let controller = if link.up { link.health.controller } else { Some(Controller::Stopped) };
+        let state = controller.map(State::Controller);
         let about = shown(format!("CAN interface of the kernel ({})", link.kind).as_bytes());
         let found = Found::new(Kind::SocketCan, format!("socketcan:{}", shown(link.name.as_bytes())), about);
         // A user has created this interface for a purpose, even if it is virtual.

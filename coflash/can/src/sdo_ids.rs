@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::{CobId, Frame, NodeId};
 use embedded_can::Frame as _;
 
-use super::adapter::{Adapter, AdapterError};
+use super::adapter::{passes_on, Adapter, AdapterError};
 use super::health::{Health, Losses};
 
 /// An adapter for devices that use their own identifiers for SDO requests and answers
@@ -69,17 +69,7 @@ impl<A: Adapter> Adapter for SdoIds<A> {
         }
     }
 
-    fn now(&self) -> Duration {
-        self.adapter.now()
-    }
-
-    fn health(&mut self) -> Option<Health> {
-        self.adapter.health()
-    }
-
-    fn losses(&self) -> Losses {
-        self.adapter.losses()
-    }
+    passes_on!(this => this.adapter);
 }
 
 #[cfg(test)]

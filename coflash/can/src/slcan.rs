@@ -3,7 +3,6 @@
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::TcpStream;
-use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
@@ -15,7 +14,7 @@ use super::digits::{hex_bytes, hex_number};
 use super::echo::Echoes;
 use super::health::{Controller, Health, Losses};
 use super::ports;
-use super::tcp::{connect, waits, PATIENCE};
+use super::tcp::{connect, read_within, waits, PATIENCE};
 
 mod opening;
 mod queue;
@@ -32,9 +31,6 @@ const LONGEST_MESSAGE: usize = 64;
 const MOST_EARLY: usize = 1024;
 /// The speed of a serial line in bit/s, if the URL has none; adapters on USB ignore it.
 pub(super) const BAUD: u32 = 115_200;
-/// A wait that is shorter than the clocks of some systems can tell is made of such pauses.
-const SHORT: Duration = Duration::from_millis(5);
-const SLICE: Duration = Duration::from_micros(100);
 
 /// The line that carries the text.
 pub trait Line: Read + Write {
@@ -65,22 +61,8 @@ impl Line for TcpStream {
         self.set_read_timeout(Some(timeout.max(Duration::from_micros(1))))
     }
 
-    /// The system rounds a time-out up to its tick of some milliseconds.
     fn read_within(&mut self, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
-        if timeout >= SHORT {
-            self.set_timeout(timeout)?;
-            return self.read(bytes);
-        }
-        self.set_nonblocking(true)?;
-        let end = Instant::now() + timeout;
-        let read = loop {
-            match self.read(bytes) {
-                Err(error) if waits(&error) && Instant::now() < end => thread::sleep(SLICE),
-                read => break read,
-            }
-        };
-        self.set_nonblocking(false)?;
-        read
+        read_within(self, bytes, timeout)
     }
 }
 

@@ -2,7 +2,7 @@
 //! This module has the client, and the message formats for a server.
 
 use std::collections::VecDeque;
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, ErrorKind, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,7 @@ use super::digits::{hex_bytes, hex_number};
 use super::echo::Echoes;
 use super::found::shown;
 use super::health::Health;
-use super::tcp::{connect, waits, PATIENCE};
+use super::tcp::{connect, read_within, waits, PATIENCE};
 
 /// Longer than any message of the protocol.
 const LONGEST_MESSAGE: usize = 4096;
@@ -120,12 +120,7 @@ impl Socketcand {
             }
             let left = deadline.saturating_duration_since(Instant::now());
             let mut bytes = [0; 4096];
-            let read = if left.is_zero() {
-                self.read_now(&mut bytes)
-            } else {
-                self.stream.set_read_timeout(Some(left)).and_then(|()| self.stream.read(&mut bytes))
-            };
-            match read {
+            match read_within(&mut self.stream, &mut bytes, left) {
                 Ok(0) => {
                     let closed =
                         io::Error::new(ErrorKind::ConnectionAborted, "the server closed the connection");
@@ -140,14 +135,6 @@ impl Socketcand {
                 return self.messages.next().map_err(|said| self.unexpected(said));
             }
         }
-    }
-
-    /// Reads the data that have arrived. (The system would round up a read time-out to its tick.)
-    fn read_now(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
-        self.stream.set_nonblocking(true)?;
-        let read = self.stream.read(bytes);
-        self.stream.set_nonblocking(false)?;
-        read
     }
 
     fn lost(&self, source: io::Error) -> AdapterError {

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use canopen::Frame;
 
-use super::adapter::{Adapter, AdapterError};
+use super::adapter::{passes_on, Adapter, AdapterError};
 use super::health::{Health, Losses};
 
 /// A function that gets each frame: the wall clock since 1970, the frame, and whether this tool has
@@ -59,15 +59,5 @@ impl<A: Adapter> Adapter for Tap<A> {
         Ok(frame)
     }
 
-    fn now(&self) -> Duration {
-        self.adapter.now()
-    }
-
-    fn health(&mut self) -> Option<Health> {
-        self.adapter.health()
-    }
-
-    fn losses(&self) -> Losses {
-        self.adapter.losses()
-    }
+    passes_on!(this => this.adapter);
 }

@@ -1,17 +1,40 @@
 //! TCP connections to servers.
 
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read};
 use std::net::{TcpStream, ToSocketAddrs};
-use std::time::Duration;
+use std::thread;
+use std::time::{Duration, Instant};
 
 use super::adapter::AdapterError;
 
 /// How long a server may take to accept the connection, and to accept data.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
 
+/// A wait that is shorter than the clocks of some systems can tell is made of such pauses.
+const SHORT: Duration = Duration::from_millis(5);
+const SLICE: Duration = Duration::from_micros(100);
+
 /// Whether the error only means that the socket has no data, or no room, at present.
 pub(crate) fn waits(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
+/// Reads what arrives within this time. (The system rounds a time-out up to its tick of some milliseconds.)
+pub(crate) fn read_within(stream: &mut TcpStream, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
+    if timeout >= SHORT {
+        stream.set_read_timeout(Some(timeout))?;
+        return stream.read(bytes);
+    }
+    stream.set_nonblocking(true)?;
+    let end = Instant::now() + timeout;
+    let read = loop {
+        match stream.read(bytes) {
+            Err(error) if waits(&error) && Instant::now() < end => thread::sleep(SLICE),
+            read => break read,
+        }
+    };
+    stream.set_nonblocking(false)?;
+    read
 }
 
 /// Connects to a server, `name` in messages. A read or a write waits for at most `wait`. Messages are

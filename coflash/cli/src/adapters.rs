@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use clap::Args;
-use coboot_can::{list, Found, List};
+use coboot_can::{list, Found, List, State};
 use serde_json::{json, Value};
 
 use super::context::Context;
@@ -64,7 +64,7 @@ fn row(found: &Found) -> [String; 4] {
     let none = || "-".to_string();
     let rate = found.bit_rate.map_or_else(none, |rate| format!("{} kbit/s", f64::from(rate) / 1000.0));
     let about = Some(found.about.clone()).filter(|about| !about.is_empty()).unwrap_or_else(none);
-    [found.url.clone(), about, rate, found.state.map_or_else(none, |state| state.to_string())]
+    [found.url.clone(), about, rate, found.state.map_or_else(none, |state| state.words().to_string())]
 }
 
 /// The JSON value.
@@ -75,7 +75,7 @@ pub(super) fn value(list: &List) -> Value {
             "kind": found.kind.name(),
             "about": found.about,
             "bit_rate": found.bit_rate,
-            "state": found.state.map(|state| state.to_string()),
+            "state": found.state.map(State::words),
             "taken_unasked": found.certain,
         })
     };

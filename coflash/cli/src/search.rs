@@ -67,11 +67,8 @@ impl fmt::Display for Line<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Found { url, about, state, bit_rate, .. } = self.0;
         let rate = bit_rate.map(|rate| format!("{} kbit/s", f64::from(rate) / 1000.0));
-        let words = [
-            Some(about.clone()).filter(|about| !about.is_empty()),
-            rate,
-            state.map(|state| state.to_string()),
-        ];
+        let state = state.map(|state| state.words().to_string());
+        let words = [Some(about.clone()).filter(|about| !about.is_empty()), rate, state];
         let words: Vec<String> = words.into_iter().flatten().collect();
         match words.as_slice() {
             [] => f.write_str(url),

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use coboot_can::health::Controller;
 use coboot_can::{Found, Kind, State};
 
 /// An adapter.
@@ -46,11 +47,11 @@ fn listed(Found { kind, url, about, state, .. }: Found) -> Listed {
         name,
         product: Some(about).filter(|about| kind != Kind::SocketCan && about != "serial port"),
         state: state.map(|state| match state {
-            State::Off => "port-off",
+            State::Controller(Controller::Stopped) => "port-off",
             State::InUse => "port-used",
             State::Shared => "port-shared",
             State::Kernel => "port-kernel",
-            State::Controller(controller) => controller.words(),
+            State::Controller(_) => state.words(),
         }),
     }
 }

@@ -1,7 +1,7 @@
 //! An update through every adapter, with the tool as a separate process.
 
 use std::fs;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::net::{SocketAddr, TcpListener};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -98,11 +98,12 @@ fn a_url_that_names_no_slcan_adapter_is_explained() {
     }
 }
 
-/// The serial port is one end of a pseudo-terminal; the adapter at its other end has a UART with one speed.
+/// The serial port is one end of a pseudo-terminal; the adapter at its other end has a UART with one speed. Bytes
+/// take their time, at the speed that the tool has set; if that is another one, they are noise.
 #[cfg(target_os = "linux")]
 #[test]
 fn slcan_over_a_serial_port() {
-    use serialport::SerialPort;
+    use serialport::{SerialPort, TTYPort};
     for (query, speed, is_right) in [
         ("", 115_200, true),
         ("?baud=57600", 57_600, true),
@@ -110,76 +111,35 @@ fn slcan_over_a_serial_port() {
         ("?baud=3M", 3_000_000, true),
         ("", 57_600, false),
     ] {
-        let (mut port, slave) = serialport::TTYPort::pair().unwrap();
-        port.set_timeout(Duration::from_millis(1)).unwrap();
+        let (mut master, slave) = TTYPort::pair().unwrap();
+        master.set_timeout(Duration::from_millis(1)).unwrap();
         let bus = format!("slcan:{}{query}", slave.name().unwrap());
-        let over = std::sync::Arc::<std::sync::atomic::AtomicBool>::default();
-        let uart = Uart { port, speed, over: over.clone() };
         let server = thread::spawn(move || {
             let mut said = Vec::new();
-            let fake = converse(uart, device(), |text, stream| slcan(text, stream, &mut said), slcan_text);
-            (fake, said)
+            let adapter = |text: &mut Vec<u8>, uart: &mut TTYPort| {
+                let set = uart.baud_rate().unwrap();
+                // Start bit, eight data bits, stop bit.
+                thread::sleep(Duration::from_secs(10 * text.len() as u64) / set);
+                if set != speed {
+                    text.fill(0xFF);
+                }
+                slcan(text, uart, &mut said)
+            };
+            (converse(master, device(), adapter, slcan_text), said)
         });
         // The bit rate comes from the manual's option, because the URL contains none.
         let flashed = coflash(&["--bus", &bus, "flash", "-N", "5", "-B", "4", &data("identity-110.blk")]);
-        over.store(true, std::sync::atomic::Ordering::Relaxed);
-        let (fake, said) = server.join().unwrap();
+        // That the other end is closed ends the server.
         drop(slave);
-        if !is_right {
+        let (fake, said) = server.join().unwrap();
+        if is_right {
+            assert_eq!(flashed.exit, 0, "{bus}: {}{}", flashed.out, flashed.err);
+            check(&fake);
+            assert_eq!(said[1..5], ["C", "V", "S4", "O"], "{bus}");
+        } else {
             assert!(said.is_empty(), "{said:?}");
             flashed.fails(4, &["at 115200 bit/s as an adapter does", "append, for example, ?baud=57600"]);
-            continue;
         }
-        assert_eq!(flashed.exit, 0, "{bus}: {}{}", flashed.out, flashed.err);
-        check(&fake);
-        assert_eq!(said[1..5], ["C", "V", "S4", "O"], "{bus}");
-    }
-}
-
-/// A UART in front of the adapter. Bytes take their time, at the speed that the tool has set; if it is another
-/// one than the adapter's, they are noise. It ends on request: a pseudo-terminal does not notice that its other
-/// end was closed.
-#[cfg(target_os = "linux")]
-struct Uart {
-    port: serialport::TTYPort,
-    speed: u32,
-    over: std::sync::Arc<std::sync::atomic::AtomicBool>,
-}
-
-#[cfg(target_os = "linux")]
-impl Uart {
-    /// The bytes (start bit, eight data bits, stop bit) as they arrive.
-    fn carry(&self, bytes: &mut [u8]) {
-        let set = serialport::SerialPort::baud_rate(&self.port).unwrap();
-        thread::sleep(Duration::from_secs(10 * bytes.len() as u64) / set);
-        if set != self.speed {
-            bytes.fill(0xFF);
-        }
-    }
-}
-
-#[cfg(target_os = "linux")]
-impl Read for Uart {
-    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
-        if self.over.load(std::sync::atomic::Ordering::Relaxed) {
-            return Ok(0);
-        }
-        let len = self.port.read(bytes)?;
-        self.carry(&mut bytes[..len]);
-        Ok(len)
-    }
-}
-
-#[cfg(target_os = "linux")]
-impl Write for Uart {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let mut bytes = bytes.to_vec();
-        self.carry(&mut bytes);
-        self.port.write(&bytes)
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        self.port.flush()
     }
 }
 
