@@ -16,7 +16,7 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use shared_abi::bxcan::data_length;
 
 use super::adapter::{Adapter, AdapterError};
-use super::health::Health;
+use super::health::{Health, Losses};
 
 /// The frame that a driver reports, with the data length code of the bus: any node may send 9 to 15.
 ///
@@ -266,5 +266,9 @@ impl Adapter for Driven {
 
     fn health(&mut self) -> Option<Health> {
         Some(lock(&self.status).health)
+    }
+
+    fn losses(&self) -> Losses {
+        lock(&self.status).health.losses
     }
 }

@@ -64,7 +64,7 @@ pub struct Health {
 pub struct Losses {
     /// Frames that it refused; they were sent again in their order, if it answers each frame.
     pub refused: u32,
-    /// Frames that it did not answer, although it answers others.
+    /// Frames that it did not answer, although it answers others; and how often it says that it has lost some.
     pub lost: u32,
     /// Restarts after which its bus was opened again.
     pub restarts: u32,
@@ -90,7 +90,7 @@ impl fmt::Display for Losses {
         let all = [
             (restarts, format!("has restarted {}, and its bus was opened again", times(restarts))),
             (refused, format!("has refused {} (sent again)", frames(refused))),
-            (lost, format!("has not answered {}", frames(lost))),
+            (lost, format!("has lost or not answered {}", frames(lost))),
         ];
         let all: Vec<String> =
             all.into_iter().filter(|(count, _)| *count > 0).map(|(_, words)| words).collect();
@@ -220,9 +220,14 @@ impl Health {
                 "the adapter has reported {} of the bus: check the bit rate of each node, cable and terminators",
                 self.unclear_errors()
             )),
-            _ if self.losses.refused > 0 => Some(self.losses.to_string()),
+            _ if self.losses != Losses::default() => Some(self.losses.to_string()),
             _ => None,
         }
+    }
+
+    /// Notes whether the adapter says that it has lost frames.
+    pub(super) fn loses(&mut self, lost: bool) {
+        self.losses.lost = self.losses.lost.saturating_add(lost.into());
     }
 
     fn unclear_errors(&self) -> String {
@@ -248,8 +253,9 @@ impl Health {
         } else if data.is_empty() && class & UNCLEAR != 0 {
             self.unclear = self.unclear.saturating_add(1);
         }
-        // CAN_ERR_CRTL: TX and RX PASSIVE, TX and RX WARNING, ACTIVE.
+        // CAN_ERR_CRTL: TX and RX OVERFLOW, TX and RX PASSIVE, TX and RX WARNING, ACTIVE.
         if class & 0x04 != 0 {
+            self.loses(byte(1) & 0x03 != 0);
             self.controller = match byte(1) {
                 state if state & 0x30 != 0 => Some(Controller::Passive),
                 state if state & 0x0C != 0 => Some(Controller::Warning),
@@ -331,6 +337,10 @@ mod tests {
         ] {
             assert_eq!(after(&frames).trouble(), trouble, "{frames:X?}");
         }
+        // CRTL: RX_OVERFLOW 01h, TX_OVERFLOW 02h.
+        let lost =
+            after(&[(0x04, at(1, 0x01)), (0x04, at(1, 0x02)), (0x04, at(1, 0x40)), (0x02, at(1, 0x01))]);
+        assert_eq!(lost.disturbance().as_deref(), Some("the adapter has lost or not answered 2 frames"));
         // Data shorter than those of a driver.
         let mut health = Health::default();
         health.error_frame(0xFFFF_FFFF, &[]);

@@ -67,6 +67,8 @@ mod flag {
     pub const EXTENDED: u32 = 0x4;
     pub const ERROR: u32 = 0x20;
     pub const SENT: u32 = 0xC0;
+    /// The hardware's or the driver's queue was full.
+    pub const OVERRUN: u32 = 0x600;
     pub const FD: u32 = 0x1_0000;
     /// Stuff, form, CRC and bit errors.
     pub const DISTURBED: u32 = 0xF800;
@@ -160,6 +162,7 @@ impl Driver for Kvaser {
         if status < 0 {
             return Err(Fault::Lost(words(status)));
         }
+        self.health.loses(message.flags & flag::OVERRUN != 0);
         if message.flags & flag::ERROR != 0 {
             if message.flags & flag::DISTURBED != 0 {
                 self.health.disturbed = self.health.disturbed.saturating_add(1);

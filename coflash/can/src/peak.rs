@@ -220,6 +220,7 @@ impl Driver for Peak {
         if status & status::BUS != 0 {
             self.note(status);
         }
+        self.health.loses(status & (status::OVERRUN | status::QUEUE_OVERRUN) != 0);
         if status & status::EMPTY != 0 {
             thread::sleep(wait.min(PAUSE));
             return Ok(None);

@@ -13,7 +13,7 @@ use socketcan::{CanFrame, CanSocket, Socket, SocketOptions};
 
 use super::adapter::{Adapter, AdapterError, Obstacle};
 use super::found;
-use super::health::{Controller, Health};
+use super::health::{Controller, Health, Losses};
 use super::links;
 use super::tcp::waits;
 
@@ -185,6 +185,10 @@ impl Adapter for SocketCan {
 
     fn now(&self) -> Duration {
         self.opened.elapsed()
+    }
+
+    fn losses(&self) -> Losses {
+        self.health.losses
     }
 
     /// The reports of the error frames, and the controller's present state from the kernel.

@@ -32,7 +32,7 @@ pub(super) fn list(kinds: &[Kind]) -> Vec<Listed> {
 
 fn listed(Found { kind, url, about, state, .. }: Found) -> Listed {
     let name = url.split_once(':').map_or("", |(_, name)| name).to_owned();
-    let of_state = state.as_ref().map_or(String::new(), |state| format!(", {state}"));
+    let of_state = state.map_or(String::new(), |state| format!(", {}", state.words()));
     let (key, sets_rate) = match kind {
         Kind::SocketCan | Kind::Socketcand => ("port-socketcan", false),
         Kind::Serial => ("port-serial", true),

@@ -70,6 +70,7 @@ impl<U: Usb> Driver for GsUsb<U> {
 
     fn receive(&mut self, wait: Duration) -> Result<Option<Frame>, Fault> {
         let Some(bytes) = self.usb.read(wait).map_err(Fault::Lost)? else { return Ok(None) };
+        self.health.loses(wire::has_lost(&bytes));
         match wire::parse(&bytes, self.channel).map_err(|what| Fault::Nonsense(format!("it sends {what}")))? {
             Transfer::Frame(frame) => Ok(Some(frame)),
             // Ignore an echo that the device does not owe.

@@ -36,7 +36,8 @@ pub const CONSTANTS: u16 = 40;
 pub const FRAME: usize = 20;
 /// `echo_id` of a frame that came from the bus.
 const FROM_THE_BUS: u32 = 0xFFFF_FFFF;
-/// `GS_CAN_FLAG_FD`.
+/// `GS_CAN_FLAG_OVERFLOW` and `GS_CAN_FLAG_FD`.
+const FLAG_OVERFLOW: u8 = 0x01;
 const FLAG_FD: u8 = 0x02;
 /// `CAN_EFF_FLAG`, `CAN_RTR_FLAG` and `CAN_ERR_FLAG` (linux/can.h).
 const EXTENDED: u32 = 0x8000_0000;
@@ -181,6 +182,11 @@ pub enum Transfer {
     Error(u32, [u8; 8]),
     /// A frame of another channel, or of CAN FD.
     Other,
+}
+
+/// Whether a transfer tells that the device has lost frames of the bus.
+pub fn has_lost(bytes: &[u8]) -> bool {
+    word(bytes, 0) == Some(FROM_THE_BUS) && bytes.get(10).is_some_and(|flags| flags & FLAG_OVERFLOW != 0)
 }
 
 /// Parses one transfer.

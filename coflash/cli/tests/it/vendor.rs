@@ -38,11 +38,11 @@ fn command(folder: &Folder, lie: &str, arguments: &[&str]) -> Command {
 }
 
 /// A whole update over the stand-in.
-fn flash(folder: &Folder, bus: &[&str], options: &[&str]) -> Done {
+fn flash(folder: &Folder, lie: &str, bus: &[&str], options: &[&str]) -> Done {
     let (path, server) = serve(device());
     let file = data("identity-110.blk");
     let arguments = [bus, &["flash", "-N", "5", &file], options].concat();
-    let done = run(command(folder, "", &arguments).env("FAKE_BUS", path)).good();
+    let done = run(command(folder, lie, &arguments).env("FAKE_BUS", path)).good();
     let fake = server.join().unwrap();
     assert_eq!(fake.blocks.concat(), fs::read(data("identity-110.blk")).unwrap());
     assert_eq!(fake.running, Some(APPLICATION));
@@ -51,8 +51,18 @@ fn flash(folder: &Folder, bus: &[&str], options: &[&str]) -> Done {
 
 #[test]
 fn an_update_goes_over_each_library() {
-    flash(&vendor("peak", "peak", &[]), &["--bus", "peak:PCAN_USBBUS1@500k"], &[]);
-    flash(&vendor("kvaser", "kvaser", &[]), &["--bus", "kvaser:0@500k"], &[]);
+    for (which, bus) in [("peak", "peak:PCAN_USBBUS1@500k"), ("kvaser", "kvaser:0@500k")] {
+        let folder = vendor(which, which, &[]);
+        flash(&folder, "", &["--bus", bus], &[]);
+        // One that says that it was read too late.
+        let done = flash(&folder, "overrun", &["--bus", bus], &[]);
+        assert!(
+            done.err.contains("the adapter has lost or not answered 1 frame"),
+            "{}{}",
+            done.out,
+            done.err
+        );
+    }
 }
 
 const READ: [&str; 7] = ["read", "1000", "-N", "5", "--sdo-timeout", "200", "--sdo-attempts"];

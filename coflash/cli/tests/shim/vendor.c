@@ -115,6 +115,9 @@ uint32_t CAN_Read(uint16_t channel, struct message *message, void *time)
         message->len = 4;
         return 0;
     }
+    /* PCAN_ERROR_QOVERRUN. */
+    if (lies("overrun") && errors++ == 0)
+        return 0x60;
     return bus_read(&message->id, &message->len, message->data) ? 0 : 0x20;
 }
 
@@ -210,6 +213,7 @@ int canWrite(int handle, long id, void *data, unsigned len, unsigned flags)
 
 int canReadWait(int handle, long *id, void *data, unsigned *len, unsigned *flags, unsigned long *time, unsigned long wait)
 {
+    static int overruns;
     uint32_t number;
     uint8_t bytes;
     *flags = 2;
@@ -224,10 +228,14 @@ int canReadWait(int handle, long *id, void *data, unsigned *len, unsigned *flags
         return -123456;
     if (!bus_read(&number, &bytes, data)) {
         usleep(wait * 1000);
-        return bus_read(&number, &bytes, data) ? (*id = number, *len = bytes, 0) : -2;
+        if (!bus_read(&number, &bytes, data))
+            return -2;
     }
     *id = number;
     *len = bytes;
+    /* canMSGERR_SW_OVERRUN. */
+    if (lies("overrun") && overruns++ == 0)
+        *flags |= 0x400;
     return 0;
 }
 

@@ -102,9 +102,15 @@ fn error_frames_tell_what_is_the_matter() {
     let mut fake = device();
     let mut error = vec![0xFF, 0xFF, 0xFF, 0xFF, 0x20, 0, 0, 0x20, 8, 0, 0, 0];
     error.extend([0, 0, 0, 0, 0, 0, 128, 0]);
+    fake.incoming.push_back(error.clone());
+    // GS_CAN_FLAG_OVERFLOW.
+    error[10] = 1;
     fake.incoming.push_back(error);
     let mut driver = GsUsb::start(&mut fake, 0, 500_000).unwrap();
-    assert_eq!(driver.receive(Duration::ZERO), Ok(None));
+    for lost in [0, 1] {
+        assert_eq!(driver.receive(Duration::ZERO), Ok(None));
+        assert_eq!(driver.health().losses.lost, lost);
+    }
     let health = driver.health();
     assert_eq!((health.trouble(), health.bit_rate), (Some(Trouble::Unacknowledged), Some(500_000)));
 }
