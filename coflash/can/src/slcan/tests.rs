@@ -519,7 +519,7 @@ fn an_echo_is_no_frame_of_the_bus() {
     assert_eq!(bus.receive(ms(20)).unwrap(), None);
 }
 
-/// Sends sub-blocks of an SDO block download; returns what has reached the bus, the time, and the frames sent.
+/// Sends sub-blocks of an SDO block download; returns what has reached the bus, the time, and what was refused.
 fn sub_blocks(queue: Queue, rate: u32, latency: u64, baud: u32) -> (Vec<String>, Duration, u32) {
     let mut device = Device { queue: Some(queue), ..Device::new(nothing) };
     (device.latency, device.byte) = (Duration::from_micros(latency), Duration::from_secs(10) / baud);
