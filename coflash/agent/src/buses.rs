@@ -9,8 +9,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{channel, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use canopen::program::ProgramState;
-
 use super::config::{Device, Target, TargetKind};
 use super::controller::{Flashed, News};
 use super::firmware::Content;
@@ -18,12 +16,11 @@ use super::machine;
 use super::progress::{failure, waits, Shown};
 use super::run::{Devices, Order};
 use coboot_can::Link;
-use coflash_core::device::info::program_info;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::state::{source, supply};
 use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
 use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
-use coflash_core::update::{Event, FlashOptions, Installed, Known, Payload, Report};
+use coflash_core::update::{Event, FlashOptions, Known, Payload, Report};
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
@@ -94,7 +91,10 @@ impl<'o> Buses<'o> {
                     continue;
                 }
             }
-            if order.kept && self.runs(&mut link, &order.job) {
+            let mut session = Session::on(&mut link, order.job.node, Timing::default());
+            session.cancel_by(self.cancelled.clone());
+            let (marks, number) = (order.job.file.marks(), order.job.options.program);
+            if order.kept && marks.is_running(&mut session, number).is_ok_and(|runs| runs) {
                 let words = "the device has run this program since before the agent was restarted";
                 let _ = order.done.send(Flashed::Done(vec![words.to_string(), of(&order.job.file)]));
                 continue;
@@ -116,18 +116,6 @@ impl<'o> Buses<'o> {
         for (order, result) in orders.iter().zip(results) {
             let _ = order.done.send(flashed(&order.job, result));
         }
-    }
-}
-
-impl Buses<'_> {
-    /// Whether the device runs the program of an order, by its own account.
-    fn runs(&self, link: &mut Link, job: &Job) -> bool {
-        let mut session = Session::on(link, job.node, Timing::default());
-        session.cancel_by(self.cancelled.clone());
-        let program = job.options.program;
-        program_info(&mut session, program).is_ok_and(|has| {
-            has.state() == Some(ProgramState::Running) && job.file.marks().compare(&has) == Installed::This
-        })
     }
 }
 

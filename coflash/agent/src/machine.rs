@@ -1,6 +1,5 @@
 //! The update of a machine with a package: scan, plan and run are those of the library.
 
-use std::collections::btree_map::Entry;
 use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::Sender;
@@ -46,11 +45,11 @@ pub(super) fn update(
     };
     // Before the scan, which ends the transfers of all nodes. The others are known after it.
     let mut locks = BTreeMap::new();
-    let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
-    lock(url, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
+    let in_use = |error: Error| Flashed::NotNow(error.to_string());
+    Lock::more(url, package.nodes(), &mut locks).map_err(in_use)?;
     let mut plan =
         plan(&mut *adapter, package, &ScanOptions::default().alone(true), cancelled).map_err(unplanned)?;
-    lock(url, plan.nodes(), &mut locks)?;
+    Lock::more(url, plan.nodes(), &mut locks).map_err(in_use)?;
     for line in plan.to_string().lines() {
         let _ = news.send(News::Phase(line.to_string()));
     }
@@ -79,20 +78,6 @@ pub(super) fn update(
     let many = ManyOptions::default().cancelled(cancelled.clone());
     let options = RunOptions::default().many(many).known(*known);
     Ok(flashed(package, *known, &run(&mut *adapter, package, &plan, &options, &report)))
-}
-
-/// Locks these nodes too among the programs of this computer.
-fn lock(
-    url: &str,
-    nodes: impl Iterator<Item = NodeId>,
-    locks: &mut BTreeMap<NodeId, Lock>,
-) -> Result<(), Flashed> {
-    for node in nodes {
-        if let Entry::Vacant(free) = locks.entry(node) {
-            free.insert(Lock::of(url, node).map_err(|error| Flashed::NotNow(error.to_string()))?);
-        }
-    }
-    Ok(())
 }
 
 /// The end of an update without a plan: no device was changed.

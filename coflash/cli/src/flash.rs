@@ -577,13 +577,13 @@ pub(super) fn options() -> Command {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::package::{BESIDE_PACKAGES, FOR_PACKAGES};
+    use crate::package::{beside_packages, FOR_PACKAGES};
 
     /// An option of `flash` that is not in the list is refused beside a package.
     #[test]
     fn the_options_beside_a_package_are_options_of_flash() {
         let flash = options();
-        for id in BESIDE_PACKAGES.iter().chain(FOR_PACKAGES.iter().map(|(id, _)| id)) {
+        for id in beside_packages().chain(FOR_PACKAGES.map(|(id, _)| id)) {
             assert!(flash.get_arguments().any(|argument| argument.get_id() == id), "{id}");
         }
     }

@@ -14,7 +14,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget};
 use serde_json::{json, Value};
 
 use super::events::Lines;
-use super::output::{Exit, Failure, Output};
+use super::output::{Failure, Output};
 use super::output_file;
 use super::record;
 use super::waiting::style;
@@ -135,7 +135,8 @@ pub(super) fn diagnose_silence(
 
 /// Shows the summary and returns the result of the command.
 pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) -> Result<(), Failure> {
-    let failed = outcomes.iter().filter(|outcome| outcome.result.is_err()).count();
+    let failures: Vec<&Failure> =
+        outcomes.iter().filter_map(|outcome| outcome.result.as_ref().err()).collect();
     let document = document(outcomes);
     out.say("");
     for Outcome { name, result, .. } in outcomes {
@@ -144,22 +145,13 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
             Err(failure) => out.say(format_args!("{name}: {}", failure.to_string().trim_end())),
         }
     }
-    let (all, good) = (outcomes.len(), outcomes.len() - failed);
-    out.say(format_args!("{good} of {all} devices are done"));
+    let all = outcomes.len();
+    out.say(format_args!("{} of {all} devices are done", all - failures.len()));
     out.value(&document);
     if let Some(path) = report {
         write_report(path, &document)?;
     }
-    let cancelled =
-        |outcome: &Outcome| matches!(&outcome.result, Err(failure) if failure.exit == Exit::Cancelled);
-    let first = outcomes.iter().find_map(|outcome| outcome.result.as_ref().err());
-    match first {
-        None => Ok(()),
-        Some(first) => {
-            let exit = if outcomes.iter().any(cancelled) { Exit::Cancelled } else { Exit::Some };
-            Err(Failure::several(exit, first.legacy, failed, all))
-        }
-    }
+    Failure::of_all(&failures, all)
 }
 
 /// The results of all devices, as JSON.

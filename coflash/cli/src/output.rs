@@ -316,6 +316,14 @@ impl Failure {
         Self { legacy, ..Self::new(exit, format!("{failed} of {of} devices failed")).shown() }
     }
 
+    /// The end of a command for so many devices, of which these have failed.
+    pub(super) fn of_all(failures: &[&Self], of: usize) -> Result<(), Self> {
+        let Some(first) = failures.first() else { return Ok(()) };
+        let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
+        let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
+        Err(Self::several(exit, first.legacy, failures.len(), of))
+    }
+
     /// Nothing on the bus is a device that a package is for.
     pub(super) fn no_device_for(package: &Path) -> Self {
         let what = format!("{}: no device on the bus is one that the package is for", package.display());

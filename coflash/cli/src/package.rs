@@ -1,6 +1,5 @@
 //! `coflash package`, and the update of a machine with a package: `coflash flash machine.cpk`.
 
-use std::collections::btree_map::Entry;
 use std::collections::BTreeMap;
 use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
@@ -25,7 +24,7 @@ use super::context::Context;
 use super::device::{asked, cancelled, Patience};
 use super::file::front;
 use super::many::{begin, write_report, Board};
-use super::output::{Exit, Failure};
+use super::output::Failure;
 use super::output_file;
 use super::record;
 use super::seal::keys::{self, public_key, signing_key};
@@ -224,42 +223,20 @@ impl Checked {
 
 /// The options of `flash` that do beside a package what they do beside another file. A package has values
 /// for the others.
-pub(super) const BESIDE_PACKAGES: [&str; 31] = [
+const BESIDE_PACKAGES: [&str; 3] = [
     // What is done, and where it is said.
-    "file",
-    "legacy_file",
-    "job",
-    "report",
-    "at_once",
-    "together",
-    "from_start",
-    "block_repeats",
-    "verify",
-    "watch",
-    "wait",
-    "not_alone",
-    "no_mastership",
-    "dialect",
-    "unlock",
+    "file legacy_file job report at_once together from_start block_repeats verify watch wait not_alone \
+     no_mastership dialect unlock",
     // Time limits and transfers.
-    "boot_timeout",
-    "command_timeout",
-    "delay",
-    "repeats",
-    "sdo_attempts",
-    "sdo_timeout",
-    "segmented",
-    "silence_timeout",
+    "boot_timeout command_timeout delay repeats sdo_attempts sdo_timeout segmented silence_timeout",
     // The bus; what is ignored or refused for any file is said for a package, too.
-    "baudrate",
-    "index",
-    "vxd_type",
-    "device_no",
-    "ip_addr",
-    "ip_port",
-    "gateway_id",
-    "network_id",
+    "baudrate index vxd_type device_no ip_addr ip_port gateway_id network_id",
 ];
+
+/// Each of them.
+pub(super) fn beside_packages() -> impl Iterator<Item = &'static str> {
+    BESIDE_PACKAGES.iter().flat_map(|ids| ids.split(' '))
+}
 
 /// The options for packages alone, and what they would do.
 pub(super) const FOR_PACKAGES: [(&str, &str); 3] = [
@@ -283,8 +260,9 @@ impl Typed {
                 "leave --yes, --trust and --allow-older out, or name a package that coflash package made";
             return Err(Failure::usage(*what, advice));
         }
-        let is_free =
-            |id: &str| BESIDE_PACKAGES.contains(&id) || FOR_PACKAGES.iter().any(|(alone, _)| *alone == id);
+        let is_free = |id: &str| {
+            beside_packages().any(|free| free == id) || FOR_PACKAGES.iter().any(|(alone, _)| *alone == id)
+        };
         let refused =
             |option: &&Arg| is_typed(option.get_id().as_str()) && !is_free(option.get_id().as_str());
         let option = flash
@@ -352,23 +330,6 @@ pub(super) struct Given<'a> {
     pub(super) not_alone: bool,
 }
 
-impl Given<'_> {
-    /// Locks these nodes too, unless the user has said that others do not matter.
-    fn lock(
-        &self,
-        context: &Context,
-        nodes: impl Iterator<Item = NodeId>,
-        locks: &mut BTreeMap<NodeId, Lock>,
-    ) -> Result<(), Failure> {
-        for node in nodes.filter(|_| !self.not_alone) {
-            if let Entry::Vacant(free) = locks.entry(node) {
-                free.insert(context.lock(self.bus.as_deref(), node)?);
-            }
-        }
-        Ok(())
-    }
-}
-
 impl Machine {
     /// Updates the machine: scan, plan, confirmation, and the run.
     pub(super) fn run(&self, context: &Context, path: &Path, given: &Given<'_>) -> Result<(), Failure> {
@@ -389,8 +350,8 @@ impl Machine {
         let flag = cancelled()?;
         // Before the scan, which ends the transfers of all nodes. The others are known after it.
         let mut locks = BTreeMap::new();
-        let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
-        given.lock(context, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
+        let url = context.url(given.bus.as_deref())?;
+        Lock::more(&url, package.nodes().filter(|_| !given.not_alone), &mut locks)?;
         let waiting = context.waiting("all nodes were asked, and had time to answer");
         let scan = ScanOptions::default().timing(given.patience.timing()).alone(!given.not_alone);
         let mut plan = machine::plan(&mut *adapter, &package, &scan, &flag).map_err(|error| match error {
@@ -405,8 +366,8 @@ impl Machine {
         if plan.updates() > 0 {
             self.confirm(context, &plan)?;
         }
-        given.lock(context, plan.nodes(), &mut locks)?;
-        let earlier = given.report.and_then(record::document);
+        Lock::more(&url, plan.nodes().filter(|_| !given.not_alone), &mut locks)?;
+        let before = record::before(given.report);
         begin(&begun(&plan), given.report)?;
         let nodes: Vec<NodeId> = plan.nodes().collect();
         let board = Board::new(out, &nodes);
@@ -418,7 +379,7 @@ impl Machine {
         let options = RunOptions::default().flash(given.flash).many(given.many.clone());
         let outcomes = machine::run(&mut *adapter, &package, &plan, &options, &show);
         board.finish();
-        summary(context, path, &package, &plan, (outcomes, earlier), given.report)
+        summary(context, path, &package, &plan, outcomes, (&before, given.report))
     }
 
     /// Asks the user for the start.
@@ -453,80 +414,67 @@ fn begun(plan: &Plan) -> Value {
     .collect()
 }
 
-/// Shows the outcome of each program of each device; the result of the command.
+/// Shows the outcome of each program of each device; the result of the command. `before` are the runs before this
+/// one.
 fn summary(
     context: &Context,
     path: &Path,
     package: &Package,
     plan: &Plan,
-    (outcomes, earlier): (Vec<Outcome>, Option<Value>),
-    report: Option<&Path>,
+    outcomes: Vec<Outcome>,
+    (before, report): (&[Value], Option<&Path>),
 ) -> Result<(), Failure> {
     let out = context.out;
-    let mut failures: Vec<Failure> = Vec::new();
-    let mut devices: Vec<Value> = Vec::new();
+    let (mut failures, mut devices) = (Vec::new(), Vec::new());
     out.say("");
     let all = outcomes.len();
     for Outcome { node, entry, result, .. } in outcomes {
         let Some((program, _)) = package.programs().nth(entry) else { continue };
         let whom = node.map_or_else(|| "machine".to_owned(), |node| format!("node {node}"));
-        let mut value = json!({
-            "node": node.map(NodeId::get),
-            "name": whom,
-            "program": program.name,
-            "image": program.file,
-            "ok": result.is_ok(),
-        });
+        let (name, image) = (&program.name, &program.file);
+        let mut value = json!({ "name": whom, "program": name, "image": image, "ok": result.is_ok() });
+        value["node"] = json!(node.map(NodeId::get));
         let device = plan.devices.iter().find(|device| Some(device.node) == node);
-        if let Some(device) = device {
-            let step = device.steps.iter().find(|step| step.entry == entry);
+        let step = device.and_then(|device| device.steps.iter().find(|step| step.entry == entry));
+        if let Some((device, step)) = device.zip(step) {
             value["serial_number"] = json!(device.identity[3]);
-            value["from"] = json!(step.and_then(|step| step.from.as_ref()));
-            value["to"] = json!(step.map(|step| &step.to));
-            value["crc_tells_nothing"] = json!(step.is_some_and(|step| step.crc_tells_nothing));
+            (value["from"], value["to"]) = (json!(step.from), json!(step.to));
+            value["every_version_has_this_crc"] = step.every_version_has_this_crc.into();
         }
-        match result {
-            Ok(Good::Had) => {
-                let began = record::unended(&value, earlier.as_ref());
-                let words = began.as_ref().map_or_else(
-                    || "it had this program".to_owned(),
-                    |began| {
-                        format!("it has this program from the update that began at {began} and did not end")
-                    },
-                );
-                out.say(format_args!("{whom}: {}: {words}", program.name));
-                value["state"] = if began.is_some() { "resumed" } else { "had" }.into();
-            }
+        let (state, words) = match result {
+            Ok(Good::Had) => match record::unended(&value, before) {
+                None => ("had", "it had this program".to_owned()),
+                Some(began) => {
+                    let update = format!("the update that began at {began} and did not end");
+                    ("resumed", format!("it has this program from {update}"))
+                }
+            },
             Ok(Good::Updated(report)) => {
-                out.say(format_args!("{whom}: {}: {report}", program.name));
-                value["state"] = "updated".into();
                 value["report"] = json!(report);
+                ("updated", report.to_string())
             }
             Err(bad) => {
                 let failure = match bad {
                     Bad::Left(fault) => Failure::of_device(&fault),
                     Bad::Failed(failed) => Failure::from(failed.error).leaving(Some(failed.left)),
                 };
-                // Of another machine, the plan has said it.
-                if !plan.is_of_other_machine() {
-                    out.say(format_args!("{whom}: {}: {}", program.name, failure.to_string().trim_end()));
-                }
-                value["state"] = "failed".into();
-                value["error"] = failure.value()["error"].clone();
+                value["error"] = failure.value()["error"].take();
+                let words = failure.to_string().trim_end().to_owned();
                 failures.push(failure);
+                ("failed", words)
             }
+        };
+        // Of another machine, the plan has said it.
+        if state != "failed" || !plan.is_of_other_machine() {
+            out.say(format_args!("{whom}: {name}: {words}"));
         }
+        value["state"] = state.into();
         devices.push(value);
     }
     let failed = failures.len();
     out.say(format_args!("{} of {all} programs are in their devices", all - failed));
-    let document = json!({
-        "command": "flash",
-        "package": path.display().to_string(),
-        "devices": devices,
-        "foreign": plan.foreign,
-        "failed": failed,
-    });
+    let mut document = json!({ "command": "flash", "devices": devices, "failed": failed });
+    (document["package"], document["foreign"]) = (path.display().to_string().into(), json!(plan.foreign));
     if let Some(report) = report {
         write_report(report, &document)?;
     }
@@ -534,8 +482,5 @@ fn summary(
         return Err(Failure::no_device_for(path));
     }
     out.value(&document);
-    let Some(first) = failures.first() else { return Ok(()) };
-    let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
-    let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
-    Err(Failure::several(exit, first.legacy, failed, all))
+    Failure::of_all(&failures.iter().collect::<Vec<_>>(), all)
 }

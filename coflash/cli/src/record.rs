@@ -199,21 +199,21 @@ pub(super) fn begun(devices: &Value) -> Result<(), String> {
     report.write(&[("begun", devices.clone())])
 }
 
-/// A document that a run has written.
-pub(super) fn document(path: &Path) -> Option<Value> {
-    serde_json::from_str(&read_text(path).ok()?).ok()
-}
-
-/// When the update of a device's program was begun that did not end: of the runs in the folder of
-/// the reports and of `earlier`, the document of one more, the latest counts.
-pub(super) fn unended(device: &Value, earlier: Option<&Value>) -> Option<String> {
+/// The documents of the runs before, the latest first: `report`, and those in the folder of the reports.
+pub(super) fn before(report: Option<&Path>) -> Vec<Value> {
     let all = folder().and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
     let mut runs: Vec<_> = all.filter_map(|run| Some(run.ok()?.path().join(FILES[0]))).collect();
     // Their names begin with their times.
     runs.sort();
+    let runs = report.map(Path::to_path_buf).into_iter().chain(runs.into_iter().rev());
+    runs.filter_map(|run| serde_json::from_str(&read_text(&run).ok()?).ok()).collect()
+}
+
+/// When the update of a device's program was begun that did not end: of the runs `before`, the latest with this
+/// program counts.
+pub(super) fn unended(device: &Value, before: &[Value]) -> Option<String> {
     let is_of = |parts: &[&str], begun: &Value| parts.iter().all(|part| begun[*part] == device[*part]);
-    let mut runs = earlier.cloned().into_iter().chain(runs.iter().rev().filter_map(|run| document(run)));
-    runs.find_map(|run| {
+    before.iter().find_map(|run| {
         let begun =
             run["begun"].as_array()?.iter().find(|of| is_of(&["node", "serial_number", "program"], of))?;
         let did_not_end = run["ended"].is_null() && is_of(&["to"], begun);

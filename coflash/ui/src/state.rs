@@ -44,9 +44,9 @@ pub(super) struct State {
     #[serde(serialize_with = "address")]
     pub(super) lss: Option<LssAddress>,
     pub(super) readback: Option<Readback>,
-    /// What is known of devices whose last update has failed, by node-ID.
+    /// What is known of devices whose last update has failed: by node-ID, with the serial number (1018h/4).
     #[serde(skip)]
-    pub(super) known: BTreeMap<u8, DeviceState>,
+    known: BTreeMap<u8, (Option<u32>, DeviceState)>,
     pub(super) reports: Vec<Report>,
 }
 
@@ -324,13 +324,22 @@ impl State {
     pub(super) fn recall(&mut self, nodes: &[NodeId], results: &mut [Result<update::Report, Failed>]) {
         for (node, result) in nodes.iter().map(|node| node.get()).zip(results) {
             match result {
-                Err(Failed { left, .. }) if left.state == DeviceState::Untouched => {
-                    left.state = self.known.get(&node).copied().unwrap_or(left.state);
-                }
-                Err(Failed { left, .. }) => drop(self.known.insert(node, left.state)),
+                Err(Failed { left, .. }) => left.state = self.left(node, left.state),
                 Ok(_) => drop(self.known.remove(&node)),
             }
         }
+    }
+
+    /// The state of a device after an update that has failed: if this one changed nothing, that of the one before.
+    fn left(&mut self, node: u8, left: DeviceState) -> DeviceState {
+        let serial = self.devices.as_ref().and_then(|devices| devices.get(&node)?.identity[3]);
+        if left != DeviceState::Untouched {
+            self.known.insert(node, (serial, left));
+            return left;
+        }
+        // Another device may be there since then.
+        let known = self.known.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
+        known.map_or(left, |(_, state)| *state)
     }
 
     /// Enters a task as the running one.
@@ -509,5 +518,25 @@ impl Notice {
 
     pub(super) fn error(error: &Error) -> Self {
         Self::failed(error.to_string(), advice::on_page(&error.advice()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Another device at the node has not lost its program; one without an answer may be that of before.
+    #[test]
+    fn what_is_known_of_a_device_is_not_known_of_another_one() {
+        let mut state = State::default();
+        let mut after = |serial, left| {
+            let identity = [None, None, None, serial];
+            state.devices = Some([(5, Device { identity, ..Device::default() })].into());
+            state.left(5, left)
+        };
+        let (erased, untouched) = (DeviceState::Erased, DeviceState::Untouched);
+        assert_eq!(after(Some(1), erased), erased);
+        let later = [Some(1), Some(2), None].map(|serial| after(serial, untouched));
+        assert_eq!(later, [erased, untouched, erased]);
     }
 }

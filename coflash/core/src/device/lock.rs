@@ -4,6 +4,8 @@
 //! The operating system holds the lock during the life of the process; a file that is left over has
 //! no effect. If the file cannot be created, there is no lock.
 
+use std::collections::btree_map::Entry;
+use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -31,6 +33,23 @@ impl Lock {
     pub fn of(url: &str, node: NodeId) -> Result<Self, Error> {
         let folder = std::env::var_os("XDG_RUNTIME_DIR").filter(|folder| !folder.is_empty());
         Self::in_folder(&folder.map_or_else(std::env::temp_dir, PathBuf::from), url, node)
+    }
+
+    /// Locks these nodes of the bus too, beside those that are in `locks`.
+    ///
+    /// # Errors
+    /// The errors of [`of`](Self::of), for the first node on which another process works.
+    pub fn more(
+        url: &str,
+        nodes: impl Iterator<Item = NodeId>,
+        locks: &mut BTreeMap<NodeId, Self>,
+    ) -> Result<(), Error> {
+        for node in nodes {
+            if let Entry::Vacant(free) = locks.entry(node) {
+                free.insert(Self::of(url, node)?);
+            }
+        }
+        Ok(())
     }
 
     /// Locks a node by a file in this folder.

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use canopen::NodeId;
 use sha2::{Digest as _, Sha256};
 
 use super::fault::Fault;
@@ -120,6 +121,11 @@ impl Package {
     /// Its programs in the order of the update, with their entries in the manifest.
     pub fn programs(&self) -> impl ExactSizeIterator<Item = (&Entry, &Payload)> {
         self.manifest.programs.iter().zip(&self.programs)
+    }
+
+    /// The nodes that it names.
+    pub fn nodes(&self) -> impl Iterator<Item = NodeId> + '_ {
+        self.manifest.programs.iter().flat_map(|entry| &entry.nodes).filter_map(|node| NodeId::new(*node))
     }
 
     /// When the newest of its programs was made, in seconds since 1970 (UTC), if any says so.

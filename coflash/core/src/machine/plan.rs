@@ -5,14 +5,13 @@ use std::fmt;
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
 
-use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_DATE};
-use canopen::{Address, NodeId};
+use canopen::program::ProgramState;
+use canopen::NodeId;
 use serde::{Serialize, Serializer};
 
 use super::fault::{DeviceFault, Fault};
 use super::manifest::Entry;
 use super::package::{version, Package};
-use crate::device::error::reported;
 use crate::device::info::{self, hex, program_info, DeviceInfo, ProgramInfo};
 use crate::device::scan::{scan, Found, ScanOptions};
 use crate::device::{Error, Session};
@@ -74,7 +73,7 @@ pub struct Step {
     pub todo: Todo,
     /// Whether the device reports the CRC of the program, and that is the CRC of each of its versions: the program
     /// is written, because nobody knows whether the device has it.
-    pub crc_tells_nothing: bool,
+    pub every_version_has_this_crc: bool,
 }
 
 /// What is to be done with a program of a device.
@@ -174,7 +173,8 @@ pub fn plan(
     for device in &mut plan.devices {
         let Some(info) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
         for step in &mut device.steps {
-            let Some((entry, new)) = package.program(step.entry) else { continue };
+            let of_step = package.program(step.entry).zip(package.marks(step.entry));
+            let Some(((entry, new), marks)) = of_step else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
             let asked = match (&step.todo, info.bootloader.as_ref().filter(|_| new.is_bootloader())) {
@@ -182,7 +182,8 @@ pub fn plan(
                     program_info(&mut session, bootloader.number)
                         .map(|has| has_bootloader(info, &has, new).then_some(Todo::Has))
                 }
-                (Todo::Has, None) => is_of_other_date(&mut session, entry, package.marks(step.entry))
+                (Todo::Has, None) => marks
+                    .is_of_other_date(&mut session, entry.program)
                     .map(|is_other| is_other.then_some(Todo::Update)),
                 _ => Ok(None),
             };
@@ -195,18 +196,6 @@ pub fn plan(
         }
     }
     Ok(plan)
-}
-
-/// Whether the program that runs, with the right CRC, was made at another time: 1F52h has the date of what runs, and
-/// zeros for none.
-fn is_of_other_date(session: &mut Session<'_>, entry: &Entry, marks: Option<&Marks>) -> Result<bool, Error> {
-    let Some(wanted) = marks.map(|marks| marks.date).filter(|date| *date != [0; 2]) else { return Ok(false) };
-    let mut number = |index, sub| reported(session.read_number(Address::new(index, sub)));
-    if number(PROGRAM_CONTROL, entry.program)? != Some(ProgramState::Running as u32) {
-        return Ok(false);
-    }
-    let date = [number(PROGRAM_DATE, 1)?, number(PROGRAM_DATE, 2)?].map(Option::unwrap_or_default);
-    Ok(date != [0; 2] && date != wanted)
 }
 
 /// Matches the nodes of a scan with the programs of the package.
@@ -283,8 +272,15 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
             });
         }
         let (from, to) = versions(info, entry, program);
-        let crc_tells_nothing = installed == Installed::Unknown && todo == Todo::Update;
-        steps.push(Step { entry: at, program: entry.name.clone(), from, to, todo, crc_tells_nothing });
+        let every_version_has_this_crc = installed == Installed::Unknown && todo == Todo::Update;
+        steps.push(Step {
+            entry: at,
+            program: entry.name.clone(),
+            from,
+            to,
+            todo,
+            every_version_has_this_crc,
+        });
     }
     // A package may have a program for each device that can be at a node.
     let served: Vec<Option<u8>> =
@@ -410,7 +406,7 @@ impl fmt::Display for Stranger {
 }
 
 /// Why a program is written whose CRC the device reports.
-const CRC_TELLS_NOTHING: &str =
+const EVERY_VERSION_HAS_THIS_CRC: &str =
     "warning: each version of this program may have this CRC, because it has a CRC-32 of \
      its own: nobody knows whether the device has it, so it is written";
 
@@ -422,7 +418,7 @@ impl fmt::Display for Plan {
         for device in &self.devices {
             let serial =
                 device.identity[3].map_or(String::new(), |serial| format!(" (serial number {serial:08X}h)"));
-            for Step { program, from, to, todo, crc_tells_nothing, .. } in &device.steps {
+            for Step { program, from, to, todo, every_version_has_this_crc, .. } in &device.steps {
                 write!(f, "node {}: {program}: ", device.node)?;
                 let from = from.as_deref().unwrap_or("no program");
                 match todo {
@@ -431,8 +427,8 @@ impl fmt::Display for Plan {
                     Todo::Older => writeln!(f, "it has {from}, and {to} is older: not written{serial}")?,
                     Todo::Leave(fault) => writeln!(f, "is not written: {fault}")?,
                 }
-                if *crc_tells_nothing {
-                    writeln!(f, "  {}", CRC_TELLS_NOTHING)?;
+                if *every_version_has_this_crc {
+                    writeln!(f, "  {}", EVERY_VERSION_HAS_THIS_CRC)?;
                 }
             }
         }

@@ -3,15 +3,16 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use canopen::program::FlashError;
+use canopen::program::{FlashError, ProgramState, PROGRAM_CONTROL, PROGRAM_DATE};
+use canopen::Address;
 use seal::wire::BOOTLOADER;
 use shared_abi::block_file::{fits, Difference, ProgramVersion};
 use shared_abi::date;
 use shared_abi::ram_image::Version;
 
-use crate::device::error::{flash_error_number, IdentityPart};
-use crate::device::info::{Identity, ProgramInfo};
-use crate::device::Form;
+use crate::device::error::{flash_error_number, reported, Error, IdentityPart};
+use crate::device::info::{program_info, Identity, ProgramInfo};
+use crate::device::{Form, Session};
 use crate::file::checksum::is_of_self_checked;
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Format};
@@ -193,7 +194,7 @@ pub struct Marks {
     tells_nothing: bool,
     version: Option<ProgramVersion>,
     /// The elements of 1F52h; zeros for none.
-    pub(crate) date: [u32; 2],
+    date: [u32; 2],
 }
 
 /// What a device's values say about whether it has a program.
@@ -218,6 +219,28 @@ impl Marks {
             true if self.tells_nothing => Installed::Unknown,
             true => Installed::This,
         }
+    }
+
+    /// Whether the device runs the program, by its own account.
+    ///
+    /// # Errors
+    /// Those of [`program_info`].
+    pub fn is_running(&self, session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
+        let has = program_info(session, number)?;
+        let is_this = has.state() == Some(ProgramState::Running) && self.compare(&has) == Installed::This;
+        Ok(is_this && !self.is_of_other_date(session, number)?)
+    }
+
+    /// Whether the program that runs, with the right CRC, was made at another time: 1F52h has the date of what runs,
+    /// and zeros for none.
+    pub(crate) fn is_of_other_date(&self, session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
+        let mut read = |index, sub| reported(session.read_number(Address::new(index, sub)));
+        let has_none = self.date == [0; 2];
+        if has_none || read(PROGRAM_CONTROL, number)? != Some(ProgramState::Running as u32) {
+            return Ok(false);
+        }
+        let date = [read(PROGRAM_DATE, 1)?, read(PROGRAM_DATE, 2)?].map(Option::unwrap_or_default);
+        Ok(date != [0; 2] && date != self.date)
     }
 
     /// Whether the program is older than what the device has, where both versions are known.

@@ -172,6 +172,7 @@ impl Report {
             RowState::Updated => "updated",
             RowState::Has if row.interrupted.is_some() => "resumed",
             RowState::Has => "had",
+            RowState::LeftOut => "left out",
             _ => "failed",
         };
         let hex = |part: Option<u32>| part.map_or(String::new(), |part| format!("{part:08X}h"));
@@ -254,7 +255,7 @@ mod tests {
             from: None,
             to: "1.2".to_owned(),
             state: RowState::Updated,
-            crc_tells_nothing: false,
+            every_version_has_this_crc: false,
             crc: Some(0x2144_DF1C),
         };
         Row {

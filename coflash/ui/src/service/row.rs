@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use canopen::NodeId;
-use coflash_core::machine::{Foreign, Good, Outcome, Plan, Stranger, Todo};
+use coflash_core::machine::{Bad, DeviceFault, Foreign, Good, Outcome, Plan, Stranger, Todo};
 use serde::Serialize;
 
 use super::message::Message;
@@ -58,7 +58,7 @@ pub(super) struct Step {
     pub(super) to: String,
     pub(super) state: RowState,
     /// Whether it is written because its CRC is that of each of its versions.
-    pub(super) crc_tells_nothing: bool,
+    pub(super) every_version_has_this_crc: bool,
     /// What the device has reported of it after the update: its CRC (1F56h).
     #[serde(skip)]
     pub(super) crc: Option<u32>,
@@ -114,7 +114,7 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
                 Todo::Older => RowState::Older,
                 Todo::Leave(_) => RowState::Failed,
             },
-            crc_tells_nothing: step.crc_tells_nothing,
+            every_version_has_this_crc: step.every_version_has_this_crc,
         });
         let mut row = Row {
             node: Some(device.node.get()),
@@ -157,8 +157,7 @@ pub(super) fn others(plan: &Plan) -> Vec<Other> {
 impl Row {
     /// The state of the device, from those of its programs.
     fn sum(&mut self) {
-        // Who chooses the device chooses all of its programs.
-        let all = [RowState::Older, RowState::Due, RowState::Failed, RowState::Updated, RowState::Has];
+        let all = [RowState::Due, RowState::Older, RowState::Failed, RowState::Updated, RowState::Has];
         let first = all.into_iter().find(|state| self.steps.iter().any(|step| step.state == *state));
         self.state = first.unwrap_or(self.state);
     }
@@ -175,11 +174,14 @@ impl Row {
         }
     }
 
-    /// Takes a device into the update, or leaves it out.
+    /// Takes a device into the update, or leaves it out. Beside a program that is due, an older one is left out:
+    /// the user has not chosen it.
     pub(super) fn choose(&mut self, is_chosen: bool) {
-        let next = if is_chosen { RowState::Waiting } else { RowState::LeftOut };
+        let wanted = self.state;
         let due = self.steps.iter_mut().map(|step| &mut step.state).chain([&mut self.state]);
-        due.filter(|state| matches!(state, RowState::Due | RowState::Older)).for_each(|state| *state = next);
+        for state in due.filter(|state| matches!(state, RowState::Due | RowState::Older)) {
+            *state = if is_chosen && *state == wanted { RowState::Waiting } else { RowState::LeftOut };
+        }
     }
 
     /// Shows how far its update is.
@@ -212,6 +214,7 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
                 row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|it| it.crc = crc);
                 RowState::Updated
             }
+            Err(Bad::Left(DeviceFault::Older { .. })) => RowState::LeftOut,
             Err(bad) => {
                 // The first reason counts: the programs after it were not begun.
                 if row.trouble.is_none() {
@@ -235,7 +238,9 @@ pub(super) fn headline(rows: &[Row]) -> (&'static str, &'static str) {
         () if has(RowState::Failed) && rows.iter().all(is_stopped) => ("stopped", "hint-stopped"),
         () if has(RowState::Failed) && !has(RowState::Updated) => ("bad-none", "hint-bad"),
         () if has(RowState::Failed) => ("bad", "hint-bad"),
-        () if has(RowState::LeftOut) => ("good-part", "hint-good-part"),
+        () if rows.iter().flat_map(|row| &row.steps).any(|step| step.state == RowState::LeftOut) => {
+            ("good-part", "hint-good-part")
+        }
         () => ("good", "hint-good"),
     }
 }

@@ -209,21 +209,11 @@ impl Station {
         };
         // The state of an update that has ended is said as it has ended.
         let says = if matches!(station, "good" | "bad") { ended.0 } else { station };
-        let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
-        let message = match (&adapter.words, &own.message, notice) {
-            (Some(words), _, _) => Some(Message::new("adapter-lost").detail(words)),
-            (None, Some(message), _) => Some(message.clone()),
-            (None, None, Some(notice)) if adapter.state == Connection::Closed => {
-                Some(Message::new("adapter-failed").detail(&notice.words))
-            }
-            (None, None, Some(notice)) => Some(Message::new("internal").detail(&notice.words)),
-            (None, None, None) => None,
-        };
         json!({
             "station": station,
             "says": says,
             "hint": hint,
-            "message": message,
+            "message": own.message(shown),
             "adapter": adapter.url,
             "open": adapter.state == Connection::Open,
             "busy": is_busy,
@@ -239,6 +229,23 @@ impl Station {
             "unsaved": own.unsaved,
             "why": own.why,
         })
+    }
+}
+
+impl State {
+    /// Why the page cannot go on as its user wants, if something is wrong.
+    fn message(&self, shown: &state::State) -> Option<Message> {
+        let adapter = &shown.adapter;
+        let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
+        match (&adapter.words, &self.message, notice) {
+            (Some(words), _, _) => Some(Message::new("adapter-lost").detail(words)),
+            (None, Some(message), _) => Some(message.clone()),
+            (None, None, Some(notice)) if adapter.state == state::Connection::Closed => {
+                Some(Message::new("adapter-failed").detail(&notice.words))
+            }
+            (None, None, Some(notice)) => Some(Message::new("internal").detail(&notice.words)),
+            (None, None, None) => None,
+        }
     }
 }
 

@@ -56,7 +56,6 @@ pub(super) fn of_device(fault: &DeviceFault) -> Message {
             .value("found", found),
         DeviceFault::OtherDevice { .. } => Message::new("trouble-other-device"),
         DeviceFault::Exchanged { .. } => Message::new("trouble-exchanged"),
-        DeviceFault::Older { .. } => Message::new("state-older"),
         DeviceFault::EarlierFailed { .. } => Message::new("trouble-earlier"),
         // The library may have more of them one day.
         _ => Message::new("trouble-other"),

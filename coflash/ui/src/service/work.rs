@@ -1,6 +1,6 @@
 //! The search and the update of a station.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use canopen::NodeId;
@@ -9,7 +9,6 @@ use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{self, Plan, PlanError, RunOptions, Todo};
 use coflash_core::update::{Event, FlashOptions, ManyOptions, Password};
-use coflash_core::Error;
 
 use super::message::Message;
 use super::report::{note_interrupted, unsaved, Entered, Of, Report};
@@ -65,8 +64,7 @@ fn search(station: &Station, link: &mut Link, shared: &Shared) -> Result<Plan, M
     let Link::Bus(adapter) = link else { return Err(Message::new("gateway")) };
     let package = &station.service.package;
     // Before the scan, which ends the transfers of all nodes.
-    let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
-    let _locks = locked(shared, named.filter_map(|node| NodeId::new(*node)))?;
+    let _locks = locked(shared, package.nodes())?;
     let scan = ScanOptions::default().alone(true);
     machine::plan(&mut **adapter, package, &scan, &shared.cancelled).map_err(|error| match error {
         PlanError::Bus(error) => trouble::of_error(&error),
@@ -75,11 +73,11 @@ fn search(station: &Station, link: &mut Link, shared: &Shared) -> Result<Plan, M
 }
 
 /// Locks nodes among the programs of this computer.
-fn locked(shared: &Shared, nodes: impl Iterator<Item = NodeId>) -> Result<Vec<Lock>, Message> {
+fn locked(shared: &Shared, nodes: impl Iterator<Item = NodeId>) -> Result<BTreeMap<NodeId, Lock>, Message> {
+    let mut locks = BTreeMap::new();
     let url = shared.read(|state| state.adapter.url.clone());
-    let nodes: BTreeSet<NodeId> = nodes.collect();
-    let locks: Result<Vec<Lock>, Error> = nodes.into_iter().map(|node| Lock::of(&url, node)).collect();
-    locks.map_err(|error| trouble::of_error(&error))
+    Lock::more(&url, nodes, &mut locks).map_err(|error| trouble::of_error(&error))?;
+    Ok(locks)
 }
 
 /// Carry out a plan that the user has confirmed.
@@ -93,6 +91,15 @@ pub(super) struct Update {
     /// The password of locked devices.
     pub(super) unlock: Option<Password>,
     pub(super) entered: Entered,
+}
+
+/// The plan for the chosen devices. Of a device without a program that is due, the older ones are chosen.
+fn chosen(plan: &Plan, nodes: &BTreeSet<NodeId>) -> Plan {
+    let mut plan = plan.clone();
+    plan.devices.retain(|device| !is_due(device) || nodes.contains(&device.node));
+    let due: BTreeSet<NodeId> = plan.nodes().collect();
+    plan.allow_older(|node| !due.contains(&node));
+    plan
 }
 
 /// Whether a plan has something that can be written to this device.
@@ -109,16 +116,6 @@ impl Update {
             row.choose(node.is_some_and(|node| self.nodes.contains(&node)));
         }
         rows
-    }
-
-    /// The plan for the chosen devices.
-    fn chosen(&self) -> Plan {
-        let Plan { devices, missing, foreign } = (*self.plan).clone();
-        let is_in = |device: &machine::Device| !is_due(device) || self.nodes.contains(&device.node);
-        let mut plan = Plan { devices: devices.into_iter().filter(is_in).collect(), missing, foreign };
-        // The user has chosen them.
-        plan.allow_older(|_| true);
-        plan
     }
 }
 
@@ -174,7 +171,13 @@ impl Work for Update {
         };
         let many = ManyOptions::default().cancelled(shared.cancelled.clone());
         let options = RunOptions::default().flash(FlashOptions::default().unlock(self.unlock)).many(many);
-        let outcomes = machine::run(&mut **adapter, &service.package, &self.chosen(), &options, &on_event);
+        let outcomes = machine::run(
+            &mut **adapter,
+            &service.package,
+            &chosen(&self.plan, &self.nodes),
+            &options,
+            &on_event,
+        );
         note(&mut rows, &outcomes);
         station.change(|own| own.known.recall(&mut rows));
         if outcomes.iter().any(trouble::is_locked) {
@@ -192,5 +195,44 @@ impl Work for Update {
         });
         // How it went is in the rows.
         Notice::done("the update has ended")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use coflash_core::machine::{Device, Step};
+
+    use super::super::row::RowState;
+    use super::*;
+
+    /// Node 5 has a newer drive program and an old table, node 6 newer ones of both, node 7 as node 5.
+    #[test]
+    fn of_older_programs_those_are_written_that_were_chosen() {
+        let [five, six, seven] = [5, 6, 7].map(|node| NodeId::new(node).unwrap());
+        let step = |entry, todo| {
+            let (program, to) = (String::new(), String::new());
+            Step { entry, program, from: None, to, todo, every_version_has_this_crc: false }
+        };
+        let device = |(node, todos): (NodeId, [Todo; 2])| {
+            let steps = (0..).zip(todos).map(|(entry, todo)| step(entry, todo)).collect();
+            Device { node, name: None, identity: [None; 4], steps }
+        };
+        let mixed = || [Todo::Older, Todo::Update];
+        let devices = [(five, mixed()), (six, [Todo::Older, Todo::Older]), (seven, mixed())].map(device);
+        let plan = Plan { devices: devices.into(), missing: Vec::new(), foreign: Vec::new() };
+        let states = |rows: &[Row]| {
+            rows.iter().map(|row| (row.state, row.steps[0].state, row.steps[1].state)).collect::<Vec<_>>()
+        };
+        let (due, older) = (RowState::Due, RowState::Older);
+        let mut rows = rows(&plan);
+        assert_eq!(states(&rows), [(due, older, due), (older, older, older), (due, older, due)]);
+        let nodes = BTreeSet::from([five, six]);
+        rows.iter_mut().for_each(|row| row.choose(row.node != Some(7)));
+        let (waits, out) = (RowState::Waiting, RowState::LeftOut);
+        assert_eq!(states(&rows), [(waits, out, waits), (waits, waits, waits), (out, out, out)]);
+        let written = chosen(&plan, &nodes).devices.into_iter().map(|device| {
+            (device.node, device.steps.into_iter().map(|step| step.todo == Todo::Update).collect::<Vec<_>>())
+        });
+        assert_eq!(written.collect::<Vec<_>>(), [(five, vec![false, true]), (six, vec![true, true])]);
     }
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex};
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coflash_core::device::scan::ScanOptions;
+use coflash_core::device::{Session, Timing};
 use coflash_core::file::checksum::CRC as CRC32;
 use coflash_core::file::convert::{program_of, Label, Options};
 use coflash_core::file::{block_file, raw, Firmware};
@@ -122,9 +123,9 @@ fn each_node_is_matched_and_a_foreign_one_is_left_alone() {
 }
 
 /// What a device reports of its program beside its CRC: identity, 2005h and 1F52h.
-struct Told(Plate, u32, [u32; 2]);
+struct Reports(Plate, u32, [u32; 2]);
 
-impl Maker for Told {
+impl Maker for Reports {
     fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
         match at {
             (0x2005, 1) => Some(Ok(self.1.to_le_bytes().to_vec())),
@@ -159,11 +160,11 @@ fn a_crc_alone_decides_nothing() {
     const DATE: u64 = 1_795_804_215;
     let crc = |package: &Package| package.programs().next().unwrap().1.crc();
     let plain = crc(&dated(2, 0, false, 0));
-    let told = [15_671, 66_615_000];
-    for (own_crc, product, date, reported, (crc, version, told), todo) in [
+    let days = [15_671, 66_615_000];
+    for (own_crc, product, date, reported, (crc, version, days), todo) in [
         (false, 0, 0, 1234, (plain, 2, [0; 2]), "has"),
         (false, 0, 0, 1234, (plain, 0, [0; 2]), "has"),
-        (false, 1234, DATE, 1234, (plain, 2, told), "has"),
+        (false, 1234, DATE, 1234, (plain, 2, days), "has"),
         (false, 0, DATE, 1234, (plain, 2, [0; 2]), "has"),
         (false, 0, DATE, 1234, (plain, 2, [15_671, 1]), "update"),
         (false, 0, 0, 1234, (plain, 1, [0; 2]), "update"),
@@ -182,13 +183,17 @@ fn a_crc_alone_decides_nothing() {
         let package = dated(2, date, own_crc, product);
         let vendor = if reported == 0 { 0 } else { 63 };
         let mut fake = device(5, reported);
-        fake.maker = Some(Box::new(Told(Plate([vendor, reported, 2, 1005]), version, told)));
+        fake.maker = Some(Box::new(Reports(Plate([vendor, reported, 2, 1005]), version, days)));
         fake.crc_of_application = Some(crc);
         let mut bus = Bus(vec![fake]);
         let mut plan = planned(&mut bus, &package);
+        // An agent that starts again asks this way.
+        let mut session = Session::new(&mut bus, NodeId::new(5).unwrap(), Timing::default());
+        let runs = package.programs().next().unwrap().1.marks().is_running(&mut session, 1).unwrap();
+        assert_eq!(runs, matches!(todo, "has" | "leave"), "{crc:08X} {version} {days:?}");
         let step = &plan.devices[0].steps[0];
-        let doubt = if step.crc_tells_nothing { "?" } else { "" };
-        let row = format!("{own_crc} {product} {date} {crc:08X} {version} {told:?}");
+        let doubt = if step.every_version_has_this_crc { "?" } else { "" };
+        let row = format!("{own_crc} {product} {date} {crc:08X} {version} {days:?}");
         assert_eq!(format!("{}{doubt}", step.todo.name()), todo, "{row}");
         assert_eq!(plan.to_string().contains("each version of this program"), !doubt.is_empty(), "{row}");
         assert_eq!(plan.is_of_other_machine(), todo == "leave", "{row}");

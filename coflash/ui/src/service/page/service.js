@@ -211,7 +211,7 @@ function row(one) {
     el("span", {}, `${step.program}: `),
     el("span", { class: "version" }, step.from ?? t("no-program"), el("span", { class: "arrow" }, " → "), el("strong", {}, step.to)),
     one.steps.length > 1 ? el("span", { class: "faint" }, ` · ${t(step.state)}`) : null,
-    step.crc_tells_nothing ? el("span", { class: "faint" }, " · " + t("crc-tells-nothing")) : null);
+    step.every_version_has_this_crc ? el("span", { class: "faint" }, " · " + t("every-version-has-this-crc")) : null);
   return el("li", { class: "device", "data-state": one.state, "data-node": one.node },
     box,
     el("div", { class: "what" },
