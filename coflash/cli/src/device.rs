@@ -133,6 +133,8 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     if let Some(flag) = FLAG.get() {
         return Ok(flag.clone());
     }
+    #[cfg(target_os = "linux")]
+    keep_ignored();
     let flag = FLAG.get_or_init(Arc::default).clone();
     let cancelled = flag.clone();
     let mut first: Option<Instant> = None;
@@ -149,6 +151,20 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     })
     .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
     Ok(flag)
+}
+
+/// What `nohup` has started outlives its terminal (POSIX): a SIGHUP that was ignored at the start is blocked in
+/// this thread, and in those that it starts.
+#[cfg(target_os = "linux")]
+fn keep_ignored() {
+    use nix::sys::signal::{SigSet, Signal};
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    // A bit for each signal from number 1 on, proc(5): SIGHUP has the lowest.
+    let ignored = ignored.and_then(|signals| u64::from_str_radix(signals.trim(), 16).ok());
+    if ignored.is_some_and(|signals| signals & 1 != 0) {
+        let _ = SigSet::from(Signal::SIGHUP).thread_block();
+    }
 }
 
 /// Waits for what the user says. A signal meanwhile ends the program at once.

@@ -71,9 +71,13 @@ enum Command {
     Flash(Box<flash::Flash>),
     Info(info::Info),
     Scan(scan::Scan),
-    Start(program::Start),
+    /// Starts the program, and waits until it answers.
+    Start(device::Program),
     Enter(program::Enter),
-    Erase(program::Erase),
+    /// Erases the program.
+    ///
+    /// A running application is called back to the bootloader first.
+    Erase(device::Program),
     Reset(reset::Reset),
     Convert(convert::Convert),
     Inspect(inspect::Inspect),
@@ -125,9 +129,9 @@ impl Command {
             Self::Flash(flash) => flash.run(context),
             Self::Info(info) => info.run(context),
             Self::Scan(scan) => scan.run(context),
-            Self::Start(start) => start.run(context),
+            Self::Start(program) => program::start(context, program),
             Self::Enter(enter) => enter.run(context),
-            Self::Erase(erase) => erase.run(context),
+            Self::Erase(program) => program::erase(context, program),
             Self::Reset(reset) => reset.run(context),
             Self::Convert(convert) => convert.run(context),
             Self::Inspect(inspect) => inspect.run(context),

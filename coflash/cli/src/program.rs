@@ -6,9 +6,7 @@ use clap::Args;
 use coflash_core::device::info::{program_info, ProgramInfo};
 use coflash_core::device::Session;
 use coflash_core::update::event::{Event, Phase};
-use coflash_core::update::steps::{
-    call_back, enter_bootloader, erase_at_once, release, reset_status, start, withdraw,
-};
+use coflash_core::update::steps::{self, call_back, enter_bootloader, erase_at_once, reset_status};
 use coflash_core::Error;
 use serde_json::{json, Value};
 
@@ -16,13 +14,6 @@ use super::catch::{self, Limit};
 use super::context::Context;
 use super::device::Program;
 use super::output::Failure;
-
-/// Starts the program, and waits until it answers.
-#[derive(Debug, Args)]
-pub(super) struct Start {
-    #[command(flatten)]
-    program: Program,
-}
 
 /// Calls the application back to the bootloader.
 ///
@@ -39,33 +30,6 @@ pub(super) struct Enter {
 
     #[command(flatten)]
     limit: Limit,
-}
-
-/// Erases the program.
-///
-/// A running application is called back to the bootloader first.
-#[derive(Debug, Args)]
-pub(super) struct Erase {
-    #[command(flatten)]
-    program: Program,
-}
-
-/// Releases the program for autostart (83h of 1F51h).
-///
-/// On a product on which it does, it then starts by itself after a reset.
-#[derive(Debug, Args)]
-pub(super) struct Release {
-    #[command(flatten)]
-    program: Program,
-}
-
-/// Withdraws the program's release for autostart.
-///
-/// The device then stays in the bootloader after a reset.
-#[derive(Debug, Args)]
-pub(super) struct Withdraw {
-    #[command(flatten)]
-    program: Program,
 }
 
 /// Shows a program's state, CRC and flash status (1F51h, 1F56h, 1F57h).
@@ -106,23 +70,22 @@ fn with(
     Ok(())
 }
 
-impl Start {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, false, |session, number, report| {
-            let running = session.find()?;
-            report(Event::Found(running));
-            if !running.is_bootloader() {
-                if runs(session, number)? {
-                    return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
-                }
-                report(Phase::CallingBack.into());
-                call_back(session)?;
-                report(Phase::InBootloader.into());
+/// `coflash start`.
+pub(super) fn start(context: &Context, program: &Program) -> Result<(), Failure> {
+    with(context, program, false, |session, number, report| {
+        let running = session.find()?;
+        report(Event::Found(running));
+        if !running.is_bootloader() {
+            if runs(session, number)? {
+                return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
             }
-            let running = start(session, number)?;
-            Ok((format!("{running} is running"), json!({ "running": running.0 })))
-        })
-    }
+            report(Phase::CallingBack.into());
+            call_back(session)?;
+            report(Phase::InBootloader.into());
+        }
+        let running = steps::start(session, number)?;
+        Ok((format!("{running} is running"), json!({ "running": running.0 })))
+    })
 }
 
 impl Enter {
@@ -144,41 +107,38 @@ impl Enter {
     }
 }
 
-impl Erase {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, true, |session, number, report| {
-            session.ensure_alone()?;
-            enter_bootloader(session, report)?;
-            let began = session.now();
-            erase_at_once(session, number)?;
-            let seconds = session.now().saturating_sub(began).as_secs_f64();
-            Ok((format!("program {number} is erased, in {seconds:.1} s"), json!({ "seconds": seconds })))
-        })
-    }
+/// `coflash erase`.
+pub(super) fn erase(context: &Context, program: &Program) -> Result<(), Failure> {
+    with(context, program, true, |session, number, report| {
+        session.ensure_alone()?;
+        enter_bootloader(session, report)?;
+        let began = session.now();
+        erase_at_once(session, number)?;
+        let seconds = session.now().saturating_sub(began).as_secs_f64();
+        Ok((format!("program {number} is erased, in {seconds:.1} s"), json!({ "seconds": seconds })))
+    })
 }
 
-impl Release {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, false, |session, number, report| {
-            // Report an absent device at once; the wait below is for a device that does not answer
-            // the command.
-            report(Event::Found(session.find()?));
-            release(session, number, report)?;
-            Ok((format!("program {number} is released for autostart"), json!({})))
-        })
-    }
+/// `coflash more release`.
+pub(super) fn release(context: &Context, program: &Program) -> Result<(), Failure> {
+    with(context, program, false, |session, number, report| {
+        // Report an absent device at once; the wait below is for a device that does not answer
+        // the command.
+        report(Event::Found(session.find()?));
+        steps::release(session, number, report)?;
+        Ok((format!("program {number} is released for autostart"), json!({})))
+    })
 }
 
-impl Withdraw {
-    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
-        with(context, &self.program, false, |session, number, report| {
-            report(Event::Found(session.find()?));
-            withdraw(session, number)?;
-            let words =
-                format!("program {number} is no longer released for autostart: it does not start by itself");
-            Ok((words, json!({})))
-        })
-    }
+/// `coflash more withdraw`.
+pub(super) fn withdraw(context: &Context, program: &Program) -> Result<(), Failure> {
+    with(context, program, false, |session, number, report| {
+        report(Event::Found(session.find()?));
+        steps::withdraw(session, number)?;
+        let words =
+            format!("program {number} is no longer released for autostart: it does not start by itself");
+        Ok((words, json!({})))
+    })
 }
 
 impl Status {

@@ -73,12 +73,16 @@ fn hidden_from(text: &str, mark: char) -> (&str, String) {
 
 /// A URL without its scheme, with its secrets hidden.
 fn without_secrets(text: &str, is_web: bool) -> String {
-    let (place, query) = hidden_from(text, '?');
-    // A bit rate is after the last @ of an adapter's URL.
-    let is_rate = |text: &str| {
-        let digits = text.trim_end_matches(['k', 'K', 'M']);
-        !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let (place, query) = match text.split_once('?') {
+        // The speed of a serial line.
+        Some((place, query)) if query.strip_prefix("baud=").is_some_and(is_number) => {
+            (place, format!("?{query}"))
+        }
+        _ => hidden_from(text, '?'),
     };
+    // A bit rate is after the last @ of an adapter's URL.
+    let is_rate = |text: &str| is_number(text.trim_end_matches(['k', 'K', 'M']));
     let (place, rate) = match place.rsplit_once('@') {
         Some((place, rate)) if is_rate(rate) => (place, format!("@{rate}")),
         _ => (place, String::new()),
@@ -139,6 +143,8 @@ mod tests {
             ),
             ("slcan:tcp://host:2000@500k. Why? \"a\\\"\"", "slcan:tcp://host:2000@500k. Why? \"a\\\"\""),
             ("slcan:/dev/ttyACM0@500k 605#2B17", "slcan:/dev/ttyACM0@500k 605#2B17"),
+            ("slcan:COM3@125k?baud=57600, and", "slcan:COM3@125k?baud=57600, and"),
+            ("slcan:COM3@125k?baud=57600&key=sesame", "slcan:COM3@125k?***"),
         ] {
             assert_eq!(without_urls(text), shown);
         }

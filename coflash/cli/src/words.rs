@@ -287,16 +287,8 @@ mod tests {
             assert_eq!(line(words), ordered, "{words}");
         }
         // Words in the right order, and words with an unknown option.
-        for words in [
-            "info --node 5",
-            "--json info",
-            "--speed 5 info",
-            "--node 5",
-            "--node 5 fly",
-            "--help",
-            "-- info",
-            "",
-        ] {
+        let unchanged = "info --node 5|--json info|--speed 5 info|--node 5|--node 5 fly|--help|-- info|";
+        for words in unchanged.split('|') {
             assert_eq!(line(words), words);
         }
     }

@@ -11,16 +11,23 @@ use clap::{Command, Subcommand};
 
 use crate::catch;
 use crate::context::Context;
+use crate::device::Program;
 use crate::output::Failure;
-use crate::program::{Release, Status, Withdraw};
+use crate::program::{self, Status};
 
 /// Single steps, debugger, reports, checks, shell, man.
 #[derive(Debug, Subcommand)]
 pub(crate) enum More {
     Status(Status),
     Catch(catch::Catch),
-    Release(Release),
-    Withdraw(Withdraw),
+    /// Releases the program for autostart (83h of 1F51h).
+    ///
+    /// On a product on which it does, it then starts by itself after a reset.
+    Release(Program),
+    /// Withdraws the program's release for autostart.
+    ///
+    /// The device then stays in the bootloader after a reset.
+    Withdraw(Program),
     Debug(debug::Debug),
     Report(report::Report),
     Shell(shell::Shell),
@@ -46,8 +53,8 @@ impl More {
         match self {
             Self::Status(status) => status.run(context),
             Self::Catch(catch) => catch.run(context),
-            Self::Release(release) => release.run(context),
-            Self::Withdraw(withdraw) => withdraw.run(context),
+            Self::Release(it) => program::release(context, it),
+            Self::Withdraw(it) => program::withdraw(context, it),
             Self::Debug(debug) => debug.run(context),
             Self::Report(report) => report.run(context),
             Self::Shell(shell) => shell.run(context, line),

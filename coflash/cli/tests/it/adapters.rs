@@ -6,18 +6,11 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use crate::commands::quick;
 use crate::tool::kernel::{converse, standard};
-use crate::tool::{coflash, data};
+use crate::tool::{bootloader, coflash, data};
 use canopen::Frame;
 use embedded_can::{Frame as _, StandardId};
-use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
-
-pub fn device() -> Fake {
-    let mut fake = quick(BOOTLOADER);
-    fake.knows_blocks = Blocks::Known(127);
-    fake
-}
+use kit::fake::{Fake, APPLICATION};
 
 /// The adapter's side of SLCAN (CAN232 manual): it acknowledges commands and records them in
 /// `said`.
@@ -76,26 +69,13 @@ pub fn serve_slcan(fake: Fake) -> (SocketAddr, JoinHandle<(Fake, Vec<String>)>) 
 
 #[test]
 fn slcan_over_tcp() {
-    let (address, server) = serve_slcan(device());
+    let (address, server) = serve_slcan(bootloader());
     flash(&format!("slcan:tcp://{address}@250k"));
     let (fake, said) = server.join().unwrap();
     check(&fake);
     // Closed before and after, 250 kbit/s is S5. No empty line: some adapters repeat their last
     // command for it.
     assert_eq!(said, ["C", "C", "V", "S5", "O", "C"]);
-}
-
-#[test]
-fn a_url_that_names_no_slcan_adapter_is_explained() {
-    for (url, exit, words) in [
-        ("slcan:", 2, "it names no serial port"),
-        ("slcan:tcp://host@500k", 2, "it must be slcan:tcp://HOST:PORT@BITRATE"),
-        ("slcan:/dev/ttyACM0@fast", 2, "its bit rate must be like 125k"),
-        ("slcan:/dev/ttyACM0@2M", 2, "its bit rate must be like 125k"),
-        ("slcan:/dev/there-is-none@500k", 4, "SLCAN adapter /dev/there-is-none cannot be opened"),
-    ] {
-        coflash(&["--bus", url, "info"]).fails(exit, &[words]);
-    }
 }
 
 /// The serial port is one end of a pseudo-terminal; the adapter at its other end has a UART with one speed. Bytes
@@ -125,7 +105,7 @@ fn slcan_over_a_serial_port() {
                 }
                 slcan(text, uart, &mut said)
             };
-            (converse(master, device(), adapter, slcan_text), said)
+            (converse(master, bootloader(), adapter, slcan_text), said)
         });
         // The bit rate comes from the manual's option, because the URL contains none.
         let flashed = coflash(&["--bus", &bus, "flash", "-N", "5", "-B", "4", &data("identity-110.blk")]);
@@ -149,7 +129,7 @@ fn slcan_over_a_serial_port() {
 fn socketcan() {
     let folder = crate::tool::folder("socketcan");
     let library = crate::tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
-    let (path, server) = crate::tool::kernel::serve(device());
+    let (path, server) = crate::tool::kernel::serve(bootloader());
     let call = |interface: &str, path: &std::path::Path| {
         let mut command = crate::tool::command();
         let bus = format!("socketcan:{interface}");

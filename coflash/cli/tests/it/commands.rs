@@ -5,19 +5,12 @@ use std::io::Write;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::tool::{coflash, data, folder, run, snapshot};
+use crate::several::unconfigured;
+use crate::tool::{coflash, data, folder, quick, run, snapshot};
 use canopen::{CobId, Frame};
 use coboot_can::candump::Line;
 use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
-
-/// A device without delays.
-pub fn quick(running: u32) -> Fake {
-    let mut fake = Fake::new(running);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
-    fake
-}
 
 /// Runs a command on a device; returns its output as text and as JSON, and the device.
 fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (crate::tool::Done, Value, Fake) {
@@ -458,13 +451,11 @@ impl coboot_can::Adapter for Heartbeats {
 
 #[test]
 fn lss_says_what_it_does() {
-    let (bus, server) = serve(LssDevice::default());
     let lss = |options: &[&str]| {
-        let (bus, server) = serve(LssDevice::default());
+        let (bus, server) = serve(unconfigured());
         let done = coflash(&[&["lss", "--bus", &bus, "--lss-timeout", "30"][..], options].concat());
         (done, server.join().unwrap())
     };
-    drop((bus, server));
     let (done, device) = lss(&["inquire"]);
     assert_eq!(
         done.out,
@@ -501,59 +492,6 @@ fn lss_says_what_it_does() {
         (&["bit-rate", "300"], "LSS knows 1000"),
     ] {
         coflash(&[&["lss"][..], options].concat()).fails(2, &[words]);
-    }
-}
-
-/// A device without node-ID for one dialogue: it answers according to CiA 305, and logs its
-/// commands.
-#[derive(Default)]
-struct LssDevice {
-    configured: bool,
-    selected: u8,
-    orders: Vec<[u8; 3]>,
-    answers: std::collections::VecDeque<[u8; 8]>,
-    now: Duration,
-}
-
-impl coboot_can::Adapter for LssDevice {
-    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
-        let bytes: [u8; 8] = *frame.exactly().unwrap();
-        let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
-        let address = [0x3Fu32, 2, 0x10000, 7];
-        match bytes[0] {
-            0x04 => self.configured = bytes[1] == 1,
-            part @ 0x40..=0x43 if address[usize::from(part - 0x40)] == number => {
-                self.selected += 1;
-                if part == 0x43 && self.selected == 4 {
-                    self.configured = true;
-                    self.answers.push_back([0x44, 0, 0, 0, 0, 0, 0, 0]);
-                }
-            }
-            0x40..=0x43 => self.selected = 0,
-            _ if !self.configured => {}
-            command @ (0x11 | 0x13 | 0x15 | 0x17) => {
-                self.orders.push([command, bytes[1], bytes[2]]);
-                if command != 0x15 {
-                    self.answers.push_back([command, 0, 0, 0, 0, 0, 0, 0]);
-                }
-            }
-            part @ 0x5A..=0x5D => {
-                let [a, b, c, d] = address[usize::from(part - 0x5A)].to_le_bytes();
-                self.answers.push_back([part, a, b, c, d, 0, 0, 0]);
-            }
-            0x5E => self.answers.push_back([0x5E, 0xFF, 0, 0, 0, 0, 0, 0]),
-            _ => {}
-        }
-        Ok(())
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
-        self.now += timeout;
-        Ok(self.answers.pop_front().map(|bytes| Frame::of(CobId::new(0x7E4).unwrap(), &bytes)))
-    }
-
-    fn now(&self) -> Duration {
-        self.now
     }
 }
 

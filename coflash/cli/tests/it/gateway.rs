@@ -16,8 +16,7 @@ use coboot_can::Cia309;
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::Error;
 
-use crate::commands::quick;
-use crate::tool::{coflash, data};
+use crate::tool::{coflash, data, quick};
 use kit::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 /// The gateway's answer to a line, or none. The gateway adds `[7]` to the answer itself.

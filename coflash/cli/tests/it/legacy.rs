@@ -4,8 +4,7 @@ use std::fs;
 use std::net::TcpListener;
 
 use super::adapters::serve_slcan;
-use crate::commands::quick;
-use crate::tool::{coflash, data, folder, run, typed, Done};
+use crate::tool::{coflash, data, folder, quick, run, typed, Done};
 use kit::fake::renewal::image;
 use kit::fake::{serve, Outcome, APPLICATION, BOOTLOADER};
 

@@ -21,11 +21,10 @@ use std::io::ErrorKind;
 use std::net::TcpListener;
 use std::path::Path;
 use std::process::Command;
-use std::time::Duration;
 
 use coflash_core::file::ihex;
 
-use crate::tool::{coflash, data, folder, run, snapshot, typed};
+use crate::tool::{coflash, data, folder, quick, run, snapshot, typed};
 use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 #[test]
@@ -384,18 +383,6 @@ fn quiet_says_nothing_and_json_says_one_document() {
 }
 
 #[test]
-fn the_date_comes_from_the_environment() {
-    let folder = folder("date");
-    let out = folder.path("out.blk");
-    let input = data("program.elf");
-    let mut command = crate::tool::command();
-    command.args(["convert", &input, &out, "--block-size", "0x110", "--vid", "0", "--pid", "1234"]);
-    command.args(["--ver", "0x00640A01"]);
-    run(command.env("SOURCE_DATE_EPOCH", "1420070400")).good();
-    assert!(fs::read(&out).unwrap() == fs::read(data("release-110.blk")).unwrap());
-}
-
-#[test]
 fn a_bad_file_is_named_and_no_device_is_touched() {
     let folder = folder("bad");
     let hex = fs::read_to_string(data("program.hex")).unwrap();
@@ -466,8 +453,6 @@ fn wrong_usage_is_explained() {
     let hex = data("program.hex");
     for (arguments, words) in [
         (&["flash", &hex][..], "give --bus URL or set COFLASH_BUS"),
-        (&["--bus", "can0", "flash", &hex], "it has no ':' after the adapter's name"),
-        (&["flash", &hex, "--node", "128"], "node-IDs are 1 to 127"),
         (&["flash", &hex, "--board", "arduino"], "known boards: nucleo-f446re, stm32f407g-disc1"),
         (&["flash", &hex, "--board", "stm32f407g-disc1", "--program", "2"], "its programs are 1 to 1"),
         (&["convert", &hex, "out", "--vid", "1"], "--pid"),
@@ -488,20 +473,8 @@ fn wrong_usage_is_explained() {
 }
 
 #[test]
-fn an_adapter_that_is_not_there_has_its_own_exit_code() {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
-    drop(listener);
-    let done = coflash(&["info", "--bus", &bus]);
-    assert_eq!(done.exit, 4);
-    assert!(done.err.contains("cannot be opened") && done.err.contains("what to do: "), "{}", done.err);
-}
-
-#[test]
 fn flash_and_info_over_a_socket() {
-    let mut fake = Fake::new(APPLICATION);
-    fake.erase_time = Duration::from_millis(50);
-    fake.restart_time = Duration::from_millis(20);
+    let fake = quick(APPLICATION);
     let (bus, server) = serve(fake);
     let done =
         coflash(&["--bus", &bus, "flash", "--node", "5", "--board", "nucleo-f446re", &data("program.elf")]);
@@ -547,8 +520,7 @@ fn the_target_is_checked_before_anything_is_erased() {
     let plain = data("program.elf");
     coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--check-target", &plain])
         .fails(2, &["--vid and --pid"]);
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(30);
+    let fake = quick(BOOTLOADER);
     let (bus, server) = serve(fake);
     let target = "--check-target --vid 0x3F --pid 1234";
     let done = typed(&format!("--json --bus {bus} flash -N 5 {target} --no-start {plain}")).good();
@@ -564,8 +536,7 @@ fn the_target_is_checked_before_anything_is_erased() {
 
 #[test]
 fn a_failure_in_json_has_the_manuals_number_and_the_devices_state() {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(5);
+    let mut fake = quick(BOOTLOADER);
     fake.on_block = Box::new(|_| Outcome::Status(0x0E));
     let (bus, server) = serve(fake);
     let done = coflash(&["flash", "--json", "--bus", &bus, "-N", "5", &data("plain-400.blk")]);
@@ -575,30 +546,4 @@ fn a_failure_in_json_has_the_manuals_number_and_the_devices_state() {
     assert_eq!((&json["error"]["exit"], &json["error"]["device"]), (&6.into(), &"erased".into()));
     assert_eq!(json["error"]["seen"]["bootloader"], true);
     server.join().unwrap();
-}
-
-#[test]
-fn a_device_that_fails_has_the_exit_code_of_its_failure() {
-    let mut refusing = Fake::new(BOOTLOADER);
-    refusing.erase_time = Duration::from_millis(5);
-    refusing.on_block = Box::new(|_| Outcome::Status(0x0C));
-    let mut absent = Fake::new(BOOTLOADER);
-    absent.running = None;
-    let mut dead = Fake::new(BOOTLOADER);
-    dead.erase_time = Duration::from_millis(5);
-    dead.starts = Some(BOOTLOADER);
-    for (fake, exit, words) in [
-        (
-            refusing,
-            6,
-            "[0x60000006]\n  the device: its bootloader is running; it contains no complete program",
-        ),
-        (absent, 5, "node 5 does not answer (reading 1000h/0) [0x60000013]"),
-        (dead, 7, "the trial failed, and the program is not released for autostart: it does not start"),
-    ] {
-        let (bus, server) = serve(fake);
-        let file = data("plain-400.blk");
-        coflash(&["flash", "--bus", &bus, "-N", "5", &file, "--boot-timeout", "300"]).fails(exit, &[words]);
-        server.join().unwrap();
-    }
 }

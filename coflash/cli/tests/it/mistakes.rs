@@ -14,7 +14,7 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use crate::tool::{data, folder, run, Done};
+use crate::tool::{data, folder, quick, run, Done};
 use canopen::{CobId, Frame};
 use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 use kit::folder::Folder;
@@ -50,26 +50,24 @@ fn absent() -> Fake {
     fake
 }
 
-/// Only another node's heartbeat, in this state.
-fn heard(id: u16, state: u8) -> Fake {
+/// Only frames with these COB-IDs and this byte, as a heartbeat has its state.
+fn heard(ids: &[u16], byte: u8) -> Fake {
     let mut fake = absent();
     fake.deaf_while_busy = true;
-    for time in 0..100 {
-        fake.later(Duration::from_millis(50 * time), Frame::of(CobId::new(id).unwrap(), &[state]));
+    for (time, id) in (0..100).flat_map(|time| ids.iter().map(move |id| (time, *id))) {
+        fake.later(Duration::from_millis(50 * time), Frame::of(CobId::new(id).unwrap(), &[byte]));
     }
     fake
 }
 
 fn starts(what: Option<u32>) -> Fake {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(5);
+    let mut fake = quick(BOOTLOADER);
     fake.starts = what;
     fake
 }
 
 fn refusing_blocks(status: u32) -> Fake {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.erase_time = Duration::from_millis(5);
+    let mut fake = quick(BOOTLOADER);
     fake.on_block = Box::new(move |_| Outcome::Status(status));
     fake
 }
@@ -80,28 +78,25 @@ fn refusing_command(command: u8, outcome: Outcome, running: u32) -> Fake {
     fake
 }
 
+#[rustfmt::skip]
 const MISTAKES: &[Mistake] = &[
     // Common mistakes in the URL of the bus.
-    Mistake(
-        "scan --bus slcan:/dev/ttyACM0@500",
-        Nothing,
-        2,
-        &["500 bit/s is not a bit rate", "did you mean 500k?"],
-    ),
+    Mistake("scan --bus slcan:/dev/ttyACM0@500", Nothing, 2,
+        &["500 bit/s is not a bit rate", "did you mean 500k?"]),
     Mistake("flash {missing} --bus slcan:COM7@125", Nothing, 2, &["did you mean 125k?"]),
+    Mistake("scan --bus slcan:", Nothing, 2, &["it names no serial port"]),
+    Mistake("scan --bus slcan:tcp://host@500k", Nothing, 2, &["it must be slcan:tcp://HOST:PORT@BITRATE"]),
+    Mistake("scan --bus slcan:/dev/ttyACM0@fast", Nothing, 2, &["its bit rate must be like 125k"]),
     Mistake("scan --bus slcan:/dev/ttyACM0@500kbit", Nothing, 2, &["did you mean 500k?"]),
     Mistake("scan --bus slcan:/dev/ttyACM0@1m", Nothing, 2, &["did you mean 1M?"]),
     Mistake("scan --bus slcan:/dev/ttyACM0@2M", Nothing, 2, &["must be like 125k, 500k or 1M"]),
-    Mistake("scan --bus can0", Nothing, 2, &["no ':'", "did you mean socketcan:can0?"]),
+    Mistake("scan --bus can0", Nothing, 2,
+        &["it has no ':' after the adapter's name", "did you mean socketcan:can0?"]),
     Mistake("scan --bus /dev/ttyACM0", Nothing, 2, &["did you mean slcan:/dev/ttyACM0@500k?"]),
     Mistake("scan --bus COM7@500k", Nothing, 2, &["did you mean slcan:COM7@500k?"]),
     Mistake("scan --bus PCAN_USBBUS1@500k", Nothing, 2, &["did you mean peak:PCAN_USBBUS1@500k?"]),
-    Mistake(
-        "scan --bus pcan:PCAN_USBBUS1@500k",
-        Nothing,
-        2,
-        &["there is no such adapter", "did you mean peak:PCAN_USBBUS1@500k?"],
-    ),
+    Mistake("scan --bus pcan:PCAN_USBBUS1@500k", Nothing, 2,
+        &["there is no such adapter", "did you mean peak:PCAN_USBBUS1@500k?"]),
     Mistake("scan --bus candlelight:0@500k", Nothing, 2, &["did you mean gs_usb:0@500k?"]),
     Mistake("scan --bus SLCAN:COM7", Nothing, 2, &["did you mean slcan:COM7?"]),
     Mistake("scan --bus peak:USB1@500k", Nothing, 2, &["no channel of PCANBasic", "peak:PCAN_USBBUS1@500k"]),
@@ -109,12 +104,8 @@ const MISTAKES: &[Mistake] = &[
     Mistake("scan --bus kvaser:can0@500k", Nothing, 2, &["no channel of CANlib", "kvaser:0@500k"]),
     Mistake("scan --bus gs_usb:@500k", Nothing, 2, &["by place or serial number", "gs_usb:0@500k"]),
     Mistake("scan --bus gs_usb:0", Nothing, 2, &["needs the bit rate of the bus", "gs_usb:0@125k"]),
-    Mistake(
-        "scan --bus socketcan:can0@500k",
-        Nothing,
-        2,
-        &["sudo ip link set can0 up type can bitrate 500000"],
-    ),
+    Mistake("scan --bus socketcan:can0@500k", Nothing, 2,
+        &["sudo ip link set can0 up type can bitrate 500000"]),
     Mistake("scan --bus socketcand://192.0.2.1", Nothing, 2, &["it names no bus", "append /can0"]),
     Mistake("scan --bus socketcand://host/can0@500k", Nothing, 2, &["the server sets the bit rate"]),
     Mistake("scan --bus cia309://192.0.2.1/1", Nothing, 2, &["a gateway carries only SDO"]),
@@ -125,255 +116,110 @@ const MISTAKES: &[Mistake] = &[
     Mistake("more conform --junit /dev/null/x", Nothing, 1, &["/dev/null/x: cannot be written"]),
     Mistake("flash {blk} --report /dev/null/x", Nothing, 1, &["/dev/null/x: cannot be written"]),
     // Serial ports.
-    Mistake(
-        "scan --bus slcan:/dev/there-is-none@500k",
-        Nothing,
-        4,
-        &["no serial port has this name", "serial port", "plug the adapter in"],
-    ),
-    Mistake(
-        "scan --bus slcan:{port}@500k",
-        Port(13),
-        4,
-        &["permission denied", "usermod -aG", "log out and in", "udev rule", "uaccess"],
-    ),
-    Mistake(
-        "scan --bus slcan:{port}@500k",
-        Port(16),
-        4,
-        &["another program uses the port", "fuser -v", "close the other program"],
-    ),
+    Mistake("scan --bus slcan:/dev/there-is-none@500k", Nothing, 4,
+        &["SLCAN adapter /dev/there-is-none cannot be opened", "no serial port has this name", "serial port",
+        "plug the adapter in"]),
+    Mistake("scan --bus slcan:{port}@500k", Port(13), 4,
+        &["permission denied", "usermod -aG", "log out and in", "udev rule", "uaccess"]),
+    Mistake("scan --bus slcan:{port}@500k", Port(16), 4,
+        &["another program uses the port", "fuser -v", "close the other program"]),
     Mistake("scan --bus slcan:/dev/null@500k", Nothing, 4, &["it is not a serial port", "slcan:PORT@500k"]),
     Mistake("scan --bus slcan:{file}@500k", Nothing, 4, &["it is not a serial port"]),
-    Mistake(
-        "scan --bus slcan:tcp://{server}@500k",
-        Server(b""),
-        4,
-        &["answered neither V (version) nor O", "not an SLCAN adapter", "serial port"],
-    ),
-    Mistake(
-        "scan --bus slcan:tcp://{server}@500k",
-        Server(b"$GPGGA,120000\r\n"),
-        4,
-        &["answered neither V", "it sent '$GPGGA,120000'"],
-    ),
-    Mistake(
-        "scan --bus slcan:tcp://{server}@500k",
-        NoServer,
-        4,
-        &["cannot be opened", "nothing listens on this port", "start the server"],
-    ),
+    Mistake("scan --bus slcan:tcp://{server}@500k", Server(b""), 4,
+        &["answered neither V (version) nor O", "not an SLCAN adapter", "serial port"]),
+    Mistake("scan --bus slcan:tcp://{server}@500k", Server(b"$GPGGA,120000\r\n"), 4,
+        &["answered neither V", "it sent '$GPGGA,120000'"]),
+    Mistake("scan --bus slcan:tcp://{server}@500k", NoServer, 4,
+        &["cannot be opened", "nothing listens on this port", "start the server"]),
     // Interfaces of the kernel.
-    Mistake(
-        "scan --bus socketcan:can9",
-        Refuses(0, "ERROR-ACTIVE"),
-        4,
-        &["no interface has this name", "this computer has these CAN interfaces: vcan0"],
-    ),
-    Mistake(
-        "scan --bus socketcan:can9",
-        Nothing,
-        4,
-        &["no interface has this name", "ip link", "type can bitrate 500000"],
-    ),
+    Mistake("scan --bus socketcan:can9", Refuses(0, "ERROR-ACTIVE"), 4,
+        &["no interface has this name", "this computer has these CAN interfaces: vcan0"]),
+    Mistake("scan --bus socketcan:can9", Nothing, 4,
+        &["no interface has this name", "ip link", "type can bitrate 500000"]),
     Mistake("scan --bus socketcan:lo", Nothing, 4, &["it is not a CAN interface"]),
-    Mistake(
-        "scan --bus socketcan:vcan0",
-        Socket(97),
-        4,
-        &["this kernel has no CAN", "sudo modprobe can_raw"],
-    ),
-    Mistake(
-        "scan --bus socketcan:vcan0",
-        Refuses(100, "STOPPED"),
-        4,
-        &["accepts no more frames", "switched off", "ip link set"],
-    ),
-    Mistake(
-        "scan --bus socketcan:vcan0",
-        Refuses(105, "BUS-OFF"),
-        4,
-        &["accepts no more frames", "bus-off", "500 kbit/s", "short circuit"],
-    ),
-    Mistake(
-        "scan --bus socketcan:vcan0",
-        Refuses(105, "ERROR-PASSIVE"),
-        4,
-        &["accepts no more frames", "no other node acknowledges", "power"],
-    ),
+    Mistake("scan --bus socketcan:vcan0", Socket(97), 4,
+        &["this kernel has no CAN", "sudo modprobe can_raw"]),
+    Mistake("scan --bus socketcan:vcan0", Refuses(100, "STOPPED"), 4,
+        &["accepts no more frames", "switched off", "ip link set"]),
+    Mistake("scan --bus socketcan:vcan0", Refuses(105, "BUS-OFF"), 4,
+        &["accepts no more frames", "bus-off", "500 kbit/s", "short circuit"]),
+    Mistake("scan --bus socketcan:vcan0", Refuses(105, "ERROR-PASSIVE"), 4,
+        &["accepts no more frames", "no other node acknowledges", "power"]),
     // Servers.
-    Mistake(
-        "scan --bus socketcand://{server}/can0",
-        NoServer,
-        4,
-        &["cannot be opened", "nothing listens on this port"],
-    ),
-    Mistake(
-        "scan --bus socketcand://{server}/can0",
-        Server(b"<html><body>"),
-        4,
-        &["'< html >' instead of '< hi >'", "check that the address"],
-    ),
-    Mistake(
-        "scan --bus socketcand://{server}/can0",
-        Server(b"< hi >< error unknown bus >"),
-        4,
-        &["unknown bus", "has this bus"],
-    ),
+    Mistake("scan --bus socketcand://{server}/can0", NoServer, 4,
+        &["cannot be opened", "nothing listens on this port"]),
+    Mistake("scan --bus socketcand://{server}/can0", Server(b"<html><body>"), 4,
+        &["'< html >' instead of '< hi >'", "check that the address"]),
+    Mistake("scan --bus socketcand://{server}/can0", Server(b"< hi >< error unknown bus >"), 4,
+        &["unknown bus", "has this bus"]),
     // The bus.
-    Mistake(
-        "info -N 5 {quick} --bus socketcan:vcan0",
-        Errors(0x88, [0, 0, 4, 0, 0, 0, 0, 0], "ERROR-ACTIVE"),
-        5,
-        &["node 5 does not answer", "disturbed", "the bit rate is wrong (the adapter has 500 kbit/s)"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus socketcan:vcan0",
-        Errors(0x20, [0; 8], "ERROR-PASSIVE"),
-        5,
-        &["node 5 does not answer", "no other node acknowledges the adapter's frames", "power", "CAN-H"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus socketcan:vcan0",
-        Errors(0x40, [0; 8], "BUS-OFF"),
-        5,
-        &["node 5 does not answer", "bus-off", "ip link set can0 down"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus socketcan:vcan0",
-        Errors(0x04, [0, 0x10, 0, 0, 0, 0, 0, 0], "ERROR-PASSIVE"),
-        5,
-        &["node 5 does not answer", "no other node acknowledges", "bit rate"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus socketcan:vcan0",
-        Errors(0x100, [0; 8], "ERROR-ACTIVE"),
-        5,
-        &[
-            "another node acknowledges the adapter's frames",
-            "check that node 5 is the right one",
-            "coflash scan",
-        ],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus {bus}",
-        Device(absent),
-        5,
-        &["node 5 does not answer", "nothing at all is heard", "bit rate", "coflash more catch", "strap"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus {bus}",
-        Device(|| heard(0x701, 0x7F)),
-        5,
-        &["node 5 does not answer", "node 1 is heard", "coflash scan"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus {bus}",
-        Device(|| heard(0x705, 0x04)),
-        5,
-        &["node 5 does not answer", "in state stopped", "coflash reset --node 5"],
-    ),
-    Mistake(
-        "info -N 5 {quick} --bus {bus}",
-        Device(|| heard(0x705, 0x05)),
-        5,
-        &["heartbeats (operational)", "another tool may be using it"],
-    ),
+    Mistake("info {kernel}", Errors(0x88, [0, 0, 4, 0, 0, 0, 0, 0], "ERROR-ACTIVE"), 5,
+        &["node 5 does not answer", "disturbed", "the bit rate is wrong (the adapter has 500 kbit/s)"]),
+    Mistake("info {kernel}", Errors(0x20, [0; 8], "ERROR-PASSIVE"), 5,
+        &["node 5 does not answer", "no other node acknowledges the adapter's frames", "power", "CAN-H"]),
+    Mistake("info {kernel}", Errors(0x40, [0; 8], "BUS-OFF"), 5,
+        &["node 5 does not answer", "bus-off", "ip link set can0 down"]),
+    Mistake("info {kernel}", Errors(0x04, [0, 0x10, 0, 0, 0, 0, 0, 0], "ERROR-PASSIVE"), 5,
+        &["node 5 does not answer", "no other node acknowledges", "bit rate"]),
+    Mistake("info {kernel}", Errors(0x100, [0; 8], "ERROR-ACTIVE"), 5,
+        &["another node acknowledges the adapter's frames", "check that node 5 is the right one",
+        "coflash scan"]),
+    Mistake("info -N 5 {node}", Device(absent), 5,
+        &["node 5 does not answer", "nothing at all is heard", "bit rate", "coflash more catch", "strap"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x701], 0x7F)), 5,
+        &["node 5 does not answer", "node 1 is heard", "coflash scan"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x705], 0x04)), 5,
+        &["node 5 does not answer", "in state stopped", "coflash reset --node 5"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x705], 0x05)), 5,
+        &["heartbeats (operational)", "another tool may be using it"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x185], 1)), 5, &["node 5 sends frames but does not answer"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x703, 0x187], 5)), 5,
+        &["the bus works, and nodes 3, 7 are heard"]),
+    Mistake("info -N 5 {node}", Device(|| heard(&[0x7FF], 0)), 5, &["no CANopen node sends frames"]),
+    Mistake("flash -N 5 {blk} {node}", Device(absent), 5,
+        &["node 5 does not answer (reading 1000h/0) [0x60000013]"]),
     // The device.
-    Mistake(
-        "flash -N 5 {blk} {quick} --bus {bus}",
-        Device(|| starts(None)),
-        7,
-        &[
-            "node 5 has not answered since the program was started",
-            "switch the device off and on",
-            "coflash more catch",
-        ],
-    ),
-    Mistake(
-        "flash -N 5 {blk} {quick} --bus {bus}",
-        Device(|| starts(Some(BOOTLOADER))),
-        7,
-        &["it does not start", "linked for this board"],
-    ),
-    Mistake(
-        "flash -N 5 {blk} {quick} --bus {bus}",
-        Device(|| refusing_blocks(0x0C)),
-        6,
-        &["0x60000006", "--board and --program"],
-    ),
-    Mistake(
-        "flash -N 5 {blk} {quick} --bus {bus}",
-        Device(|| refusing_blocks(0x80)),
-        6,
-        &["check that file and device belong together"],
-    ),
-    Mistake(
-        "enter -N 5 {quick} --bus {bus}",
-        Device(|| refusing_command(0x80, Outcome::Abort(0x0609_0030), APPLICATION)),
-        7,
-        &["refuses the call", "entry strap", "rescue window"],
-    ),
-    Mistake(
-        "enter -N 5 {quick} --bus {bus}",
-        Device(|| refusing_command(0x80, Outcome::Ignore, APPLICATION)),
-        7,
-        &["node 5", "coflash more catch", "strap"],
-    ),
-    Mistake(
-        "flash -N 5 {hex} --vid 0x40 --pid 1234 --check-target {quick} --bus {bus}",
-        Device(|| Fake::new(APPLICATION)),
-        6,
-        &["the program is for vendor-ID 00000040h", "it was not changed", "belong together"],
-    ),
+    Mistake("flash -N 5 {blk} {node}", Device(|| starts(None)), 7,
+        &["node 5 has not answered since the program was started", "switch the device off and on",
+        "coflash more catch"]),
+    Mistake("flash -N 5 {blk} {node}", Device(|| starts(Some(BOOTLOADER))), 7,
+        &["the trial failed, and the program is not released for autostart: it does not start",
+        "linked for this board"]),
+    Mistake("flash -N 5 {blk} {node}", Device(|| refusing_blocks(0x0C)), 6,
+        &["[0x60000006]\n  the device: its bootloader is running; it contains no complete program\n",
+        "--board and --program"]),
+    Mistake("flash -N 5 {blk} {node}", Device(|| refusing_blocks(0x80)), 6,
+        &["check that file and device belong together"]),
+    Mistake("enter -N 5 {node}",
+        Device(|| refusing_command(0x80, Outcome::Abort(0x0609_0030), APPLICATION)), 7,
+        &["refuses the call", "entry strap", "rescue window"]),
+    Mistake("enter -N 5 {node}", Device(|| refusing_command(0x80, Outcome::Ignore, APPLICATION)), 7,
+        &["node 5", "coflash more catch", "strap"]),
+    Mistake("flash -N 5 {hex} --vid 0x40 --pid 1234 --check-target {node}",
+        Device(|| Fake::new(APPLICATION)), 6,
+        &["the program is for vendor-ID 00000040h", "it was not changed", "belong together"]),
     // The file.
-    Mistake(
-        "flash {missing} --bus {bus}",
-        Device(absent),
-        3,
-        &["missing.blk", "No such file", "check the file's name"],
-    ),
+    Mistake("flash {missing} --bus {bus}", Device(absent), 3,
+        &["missing.blk", "No such file", "check the file's name"]),
     Mistake("flash {folder} --bus {bus}", Device(absent), 3, &["is a folder and not a file", "give a file"]),
     Mistake("flash {empty} --bus {bus}", Device(absent), 3, &["is empty", "build the program again"]),
-    Mistake(
-        "flash {html} --bus {bus}",
-        Device(absent),
-        3,
-        &["not a firmware file but a page of the web", "fetch the file itself"],
-    ),
-    Mistake(
-        "flash {top} --board nucleo-f446re --bus {bus}",
-        Device(absent),
-        3,
-        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"],
-    ),
-    Mistake(
-        "convert {top} {out} --board nucleo-f446re",
-        Nothing,
-        3,
-        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"],
-    ),
+    Mistake("flash {html} --bus {bus}", Device(absent), 3,
+        &["not a firmware file but a page of the web", "fetch the file itself"]),
+    Mistake("flash {top} --board nucleo-f446re --bus {bus}", Device(absent), 3,
+        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"]),
+    Mistake("convert {top} {out} --board nucleo-f446re", Nothing, 3,
+        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"]),
     Mistake("flash {top} --bus {bus}", Device(absent), 3, &["does not contain its address", "--board"]),
     Mistake("flash {options} --bus {bus}", Device(absent), 3, &["line 4", "option bytes", "debug probe"]),
-    Mistake(
-        "convert {options} {out} --board nucleo-f446re",
-        Nothing,
-        3,
-        &["line 4", "option bytes", "debug probe"],
-    ),
-    Mistake(
-        "convert {eeprom} {out} --board nucleo-f446re",
-        Nothing,
-        3,
-        &["line 4", "EEPROM", "leave this section out"],
-    ),
+    Mistake("convert {options} {out} --board nucleo-f446re", Nothing, 3,
+        &["line 4", "option bytes", "debug probe"]),
+    Mistake("convert {eeprom} {out} --board nucleo-f446re", Nothing, 3,
+        &["line 4", "EEPROM", "leave this section out"]),
     Mistake("convert {marked} {out}", Nothing, 3, &["byte order mark of UTF-8", "ASCII"]),
     Mistake("convert {cut} {out}", Nothing, 3, &["line 25", "cut off", "copy the file again"]),
     // The command.
     Mistake("flsh {blk}", Nothing, 2, &["unrecognized subcommand", "flash"]),
     Mistake("flash {blk} --nod 5", Nothing, 2, &["--nod", "--node"]),
-    Mistake("info --node 0", Nothing, 2, &["node-IDs are 1 to 127"]),
-    Mistake("info --node 128", Nothing, 2, &["node-IDs are 1 to 127"]),
     Mistake("info --sdo-timeout 0", Nothing, 2, &["at least 1 millisecond"]),
     Mistake("scan --search usb", Nothing, 2, &["kinds of adapters are serial, socketcan, peak"]),
     Mistake("convert {blk} {out} --board stm32f4", Nothing, 2, &["stm32f4"]),
@@ -413,6 +259,8 @@ impl Room {
         let quick = "--sdo-timeout 60 --sdo-attempts 2 --boot-timeout 300";
         let at = |name: &str| self.folder.path(name);
         let all = [
+            ("{kernel}", "-N 5 {quick} --bus socketcan:vcan0".to_string()),
+            ("{node}", "{quick} --bus {bus}".to_string()),
             ("{quick}", quick.to_string()),
             ("{bus}", bus.to_string()),
             ("{server}", server.to_string()),

@@ -9,22 +9,13 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
-use crate::tool::{command, data, folder, run, Done};
+use crate::tool::{bootloader, command, data, folder, run, Done};
 use canopen::{CobId, Frame};
 use coflash_core::machine::zip;
-use kit::fake::{serve, Blocks, Fake, Outcome, BOOTLOADER};
+use kit::fake::{serve, Outcome, BOOTLOADER};
 use kit::folder::Folder;
 use kit::hawkbit::{Action, File, Server};
 use serde_json::Value;
-
-/// A device without delays that takes block transfers.
-fn bootloader() -> Fake {
-    let mut fake = Fake::new(BOOTLOADER);
-    fake.knows_blocks = Blocks::Known(127);
-    fake.erase_time = Duration::from_millis(30);
-    fake.restart_time = Duration::from_millis(20);
-    fake
-}
 
 /// A run in the folder, recorded in `reports`.
 fn recorded(folder: &Folder, words: &[&str], variables: &[(&str, &str)]) -> Done {

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::commands::quick;
 use crate::sealing::{crc32, program, unwrapped, word, Room, START, VENDOR};
-use crate::tool::{coflash, Done};
+use crate::tool::{coflash, quick, Done};
 use kit::fake::vault::Vault;
 use kit::fake::{serve, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;

@@ -5,17 +5,14 @@ use std::fs;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::tool::{coflash, data, folder};
+use crate::tool::{coflash, data, folder, quick};
 use canopen::{CobId, Frame};
 use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 fn device(node: u8, running: u32) -> Fake {
-    let mut fake = Fake::new(running);
-    fake.node = node;
-    fake.erase_time = Duration::from_millis(100);
-    fake.restart_time = Duration::from_millis(20);
-    fake.knows_blocks = Blocks::Known(127);
+    let mut fake = quick(running);
+    (fake.node, fake.knows_blocks) = (node, Blocks::Known(127));
     fake
 }
 
@@ -95,25 +92,30 @@ fn a_job_file_says_who_gets_what() {
     coflash(&["flash", "--job", &job, "--node", "5"]).fails(2, &["cannot be used with"]);
 }
 
-/// A device without node-ID (CiA 305) that is a bootloader as soon as it has one.
-struct Unconfigured {
-    fake: Fake,
+/// A device without node-ID (CiA 305) that is a bootloader as soon as it has one. It logs what it is ordered.
+pub struct Unconfigured {
+    pub fake: Fake,
     node: u8,
-    configured: bool,
+    pub configured: bool,
     selected: usize,
-    outbox: Vec<Frame>,
+    pub orders: Vec<[u8; 3]>,
 }
 
-const ADDRESS: [u32; 4] = [0x3F, 2, 3, 4];
+const ADDRESS: [u32; 4] = [0x3F, 2, 0x10000, 7];
+
+impl Unconfigured {
+    fn answer(&mut self, command: u8, word: u32) {
+        let [a, b, c, d] = word.to_le_bytes();
+        self.fake.inject(Frame::of(CobId::LSS_RESPONSE, &[command, a, b, c, d, 0, 0, 0]));
+    }
+}
 
 impl coboot_can::Adapter for Unconfigured {
     fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
         let bytes: Option<&[u8; 8]> = frame.exactly();
-        let Some(bytes) = bytes.filter(|_| frame.cob_id() == CobId::new(0x7E5)) else {
+        let Some(bytes) = bytes.filter(|_| frame.cob_id() == Some(CobId::LSS_REQUEST)) else {
             return self.fake.send(frame);
         };
-        let answer =
-            |command, byte| Frame::of(CobId::new(0x7E4).unwrap(), &[command, byte, 0, 0, 0, 0, 0, 0]);
         let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
         match bytes[0] {
             0x04 => {
@@ -121,7 +123,7 @@ impl coboot_can::Adapter for Unconfigured {
                 if !self.configured && self.fake.running.is_none() && self.node != 0xFF {
                     self.fake.node = self.node;
                     self.fake.running = Some(BOOTLOADER);
-                    self.outbox.push(Frame::of(CobId::new(0x700 + u16::from(self.node)).unwrap(), &[0]));
+                    self.fake.inject(Frame::of(CobId::new(0x700 + u16::from(self.node)).unwrap(), &[0]));
                 }
             }
             part @ 0x40..=0x43 => {
@@ -129,13 +131,20 @@ impl coboot_can::Adapter for Unconfigured {
                 self.selected = if ADDRESS[part] == number && self.selected == part { part + 1 } else { 0 };
                 if self.selected == 4 {
                     self.configured = true;
-                    self.outbox.push(answer(0x44, 0));
+                    self.answer(0x44, 0);
                 }
             }
-            0x5E if self.configured => self.outbox.push(answer(0x5E, self.node)),
-            0x11 if self.configured => {
-                self.node = bytes[1];
-                self.outbox.push(answer(0x11, 0));
+            _ if !self.configured => {}
+            part @ 0x5A..=0x5D => self.answer(part, ADDRESS[usize::from(part - 0x5A)]),
+            0x5E => self.answer(0x5E, self.node.into()),
+            command @ (0x11 | 0x13 | 0x15 | 0x17) => {
+                self.orders.push([command, bytes[1], bytes[2]]);
+                match command {
+                    0x11 => self.node = bytes[1],
+                    0x15 => return Ok(()),
+                    _ => {}
+                }
+                self.answer(command, 0);
             }
             _ => {}
         }
@@ -143,10 +152,7 @@ impl coboot_can::Adapter for Unconfigured {
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
-        if self.outbox.is_empty() {
-            return self.fake.receive(timeout);
-        }
-        Ok(Some(self.outbox.remove(0)))
+        self.fake.receive(timeout)
     }
 
     fn now(&self) -> Duration {
@@ -154,10 +160,10 @@ impl coboot_can::Adapter for Unconfigured {
     }
 }
 
-fn unconfigured() -> Unconfigured {
+pub fn unconfigured() -> Unconfigured {
     let mut fake = device(0x7F, BOOTLOADER);
     fake.running = None;
-    Unconfigured { fake, node: 0xFF, configured: false, selected: 0, outbox: Vec::new() }
+    Unconfigured { fake, node: 0xFF, configured: false, selected: 0, orders: Vec::new() }
 }
 
 #[test]
@@ -166,21 +172,21 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
     let file = data("plain-400.blk");
     let job = |node: &str, serial: u32| {
         let text = format!(
-            "[[program]]\nimage = '{file}'\n{node}\nlss = {{ vendor = 0x3F, product = 2, revision = 3, serial = {serial} }}\n"
+            "[[program]]\nimage = '{file}'\n{node}\nlss = {{ vendor = 0x3F, product = 2, revision = 0x10000, serial = {serial} }}\n"
         );
         folder.file("job.toml", text.as_bytes())
     };
     let (url, server) = serve(unconfigured());
-    coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 4)]).good();
+    coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 7)]).good();
     let bus = server.join().unwrap();
     assert_eq!((bus.fake.node, bus.fake.blocks.concat()), (9, fs::read(&file).unwrap()));
     // The manual's options (table 9).
     let (url, server) = serve(unconfigured());
-    let legacy = ["--ser_num", "4", "--rev", "3", "--pcode", "2", "--vendor", "0x3F"];
+    let legacy = ["--ser_num", "7", "--rev", "0x10000", "--pcode", "2", "--vendor", "0x3F"];
     coflash(&[&["--bus", &url, "flash", "-N", "12", &file][..], &legacy].concat()).good();
     assert_eq!(server.join().unwrap().fake.node, 12);
     for (node, serial, words) in [
-        ("", 4, "device with serial number 00000004h: error: the device has no node-ID [0x60000017]"),
+        ("", 7, "device with serial number 00000007h: error: the device has no node-ID [0x60000017]"),
         (
             "nodes = [9]",
             5,
@@ -191,42 +197,6 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
         let done = coflash(&["--bus", &url, "flash", "--job", &job(node, serial)]);
         assert!(done.exit == 8 && done.out.contains(words), "{}{}", done.out, done.err);
         assert!(server.join().unwrap().fake.blocks.is_empty());
-    }
-}
-
-#[test]
-fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
-    let advice = |frames: &[(u16, &[u8])]| {
-        let mut bus = device(5, BOOTLOADER);
-        bus.running = None;
-        // It comes some time after the request, when the diagnosis listens.
-        let frames: Vec<Frame> =
-            frames.iter().map(|(id, data)| Frame::of(CobId::new(*id).unwrap(), data)).collect();
-        let (url, server) = serve(Chatter { fake: bus, frames, next: Duration::ZERO });
-        let done =
-            coflash(&["--bus", &url, "info", "-N", "5", "--sdo-timeout", "20", "--boot-timeout", "20"]);
-        server.join().unwrap();
-        assert_eq!(done.exit, 5, "{}", done.err);
-        assert!(
-            done.err.starts_with("error: node 5 does not answer (reading 1000h/0) [0x60000013]\n"),
-            "{}",
-            done.err
-        );
-        done.err
-    };
-    for (frames, words) in [
-        (&[][..], "nothing at all is heard on the bus"),
-        (&[(0x705, &[5][..])], "node 5 sends heartbeats (operational) but does not answer"),
-        (
-            &[(0x705, &[4])],
-            "sends heartbeats in state stopped, in which SDO does not work: coflash reset --node 5",
-        ),
-        (&[(0x185, &[1])], "node 5 sends frames but does not answer"),
-        (&[(0x703, &[5]), (0x187, &[])], "the bus works, and nodes 3, 7 are heard"),
-        (&[(0x7FF, &[])], "no CANopen node sends frames"),
-    ] {
-        let said = advice(frames);
-        assert!(said.contains(words), "{said}\n not {words}");
     }
 }
 
@@ -276,31 +246,6 @@ fn a_bus_with_nobody_but_the_tool_is_told() {
     }
 }
 
-/// A bus with permanent traffic.
-struct Chatter {
-    fake: Fake,
-    frames: Vec<Frame>,
-    next: Duration,
-}
-
-impl coboot_can::Adapter for Chatter {
-    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
-        self.fake.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
-        if self.fake.now >= self.next {
-            self.next = self.fake.now + Duration::from_millis(50);
-            self.frames.iter().for_each(|frame| self.fake.inject(*frame));
-        }
-        self.fake.receive(timeout)
-    }
-
-    fn now(&self) -> Duration {
-        self.fake.now
-    }
-}
-
 /// Ctrl-C, the stop of a service, and a terminal that is closed, in the middle of the blocks: the
 /// last one comes twice, by the system and by the shell. What is begun is in the reports before
 /// that.
@@ -311,19 +256,48 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     for signals in [&["-INT"][..], &["-TERM"], &["-HUP", "-HUP"]] {
         an_interruption_ends_in_order(&folder.path(signals[0]), signals);
     }
+    // What nohup has started outlives its terminal (POSIX).
+    #[cfg(target_os = "linux")]
+    {
+        let (slow, heard) = slow();
+        let (url, server) = serve(slow);
+        let tool = crate::tool::command();
+        let mut command = Command::new("nohup");
+        command
+            .envs(tool.get_envs().filter_map(|(name, value)| Some((name, value?))))
+            .arg(tool.get_program());
+        command.args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]);
+        let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        while heard.recv().unwrap() != 1 {}
+        signal("-HUP", &child);
+        let done = child.wait_with_output().unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+    }
 }
 
+/// A device that reports its blocks, of which the first takes some time: a signal comes in the middle.
 #[cfg(unix)]
-fn an_interruption_ends_in_order(folder: &str, signals: &[&str]) {
-    fs::create_dir(folder).unwrap();
+fn slow() -> (Fake, std::sync::mpsc::Receiver<u32>) {
     let mut slow = device(5, BOOTLOADER);
-    // Each block takes some time, so that the signal comes in the middle.
     let (reported, heard) = std::sync::mpsc::channel();
     slow.on_block = Box::new(move |block| {
         let _ = reported.send(block);
         std::thread::sleep(Duration::from_millis(if block == 1 { 300 } else { 0 }));
         Outcome::Accept
     });
+    (slow, heard)
+}
+
+#[cfg(unix)]
+fn signal(signal: &str, child: &std::process::Child) {
+    assert!(Command::new("kill").args([signal, &*child.id().to_string()]).status().unwrap().success());
+}
+
+#[cfg(unix)]
+fn an_interruption_ends_in_order(folder: &str, signals: &[&str]) {
+    fs::create_dir(folder).unwrap();
+    let (slow, heard) = slow();
     let (url, server) = serve(slow);
     let child = crate::tool::command()
         .args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")])
@@ -344,9 +318,7 @@ fn an_interruption_ends_in_order(folder: &str, signals: &[&str]) {
     let (of_device, of_run) = reports();
     assert_eq!((&of_device["begun"][0]["node"], &of_device["ended"]), (&5.into(), &Value::Null));
     assert_eq!((&of_run["begun"], &of_run["ended"]), (&of_device["begun"], &Value::Null));
-    for signal in signals {
-        assert!(Command::new("kill").args([signal, &*child.id().to_string()]).status().unwrap().success());
-    }
+    signals.iter().for_each(|it| signal(it, &child));
     let done = child.wait_with_output().unwrap();
     let err = String::from_utf8(done.stderr).unwrap();
     assert_eq!(done.status.code(), Some(130), "{signals:?}: {err}");

@@ -8,9 +8,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use crate::adapters::device;
 use crate::tool::kernel::{library, serve};
-use crate::tool::{data, folder, run, Done};
+use crate::tool::{bootloader, data, folder, run, Done};
 use kit::fake::APPLICATION;
 use kit::folder::Folder;
 
@@ -39,7 +38,7 @@ fn command(folder: &Folder, lie: &str, arguments: &[&str]) -> Command {
 
 /// A whole update over the stand-in.
 fn flash(folder: &Folder, lie: &str, bus: &[&str], options: &[&str]) -> Done {
-    let (path, server) = serve(device());
+    let (path, server) = serve(bootloader());
     let file = data("identity-110.blk");
     let arguments = [bus, &["flash", "-N", "5", &file], options].concat();
     let done = run(command(folder, lie, &arguments).env("FAKE_BUS", path)).good();

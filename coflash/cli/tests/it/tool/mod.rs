@@ -5,8 +5,25 @@ pub mod kernel;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
+use std::time::Duration;
 
+use kit::fake::{Blocks, Fake, BOOTLOADER};
 use kit::folder::Folder;
+
+/// A device without long delays.
+pub fn quick(running: u32) -> Fake {
+    let mut fake = Fake::new(running);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake
+}
+
+/// A bootloader that takes block transfers.
+pub fn bootloader() -> Fake {
+    let mut fake = quick(BOOTLOADER);
+    fake.knows_blocks = Blocks::Known(127);
+    fake
+}
 
 pub struct Done {
     pub exit: i32,
