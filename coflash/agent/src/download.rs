@@ -92,20 +92,29 @@ fn piece(
     }
     file.set_len(at)?;
     file.seek(SeekFrom::Start(at))?;
+    receive(opened.body.as_reader(), (&mut file, at), wanted, pause, goes_on)
+}
+
+/// Receives a file from the byte `at` on, and checks it.
+fn receive(
+    mut reader: impl Read,
+    (file, mut at): (&mut File, u64),
+    wanted: &Wanted,
+    pause: &Pause<'_>,
+    goes_on: bool,
+) -> io::Result<Piece> {
+    let cut = |at, why| Ok(Piece::Cut { at, why, retry_after: None });
     let began = Instant::now();
-    let mut reader = opened.body.as_reader();
+    let limit = if goes_on { pause.after } else { pause.after * LONGEST };
     let mut buffer = [0; 16 * 1024];
     loop {
-        if (pause.now)() || goes_on && began.elapsed() >= pause.after {
+        let is_late = began.elapsed() >= limit;
+        if (pause.now)() || goes_on && is_late {
             return Ok(Piece::More { at });
         }
-        if began.elapsed() >= pause.after * LONGEST {
+        if is_late {
             // Each attempt would be like this one.
-            return cut(
-                0,
-                "the transfer takes too long, and the server cannot go on later".to_string(),
-                None,
-            );
+            return cut(0, "the transfer takes too long, and the server cannot go on later".to_string());
         }
         match reader.read(&mut buffer) {
             Ok(0) => break,
@@ -117,14 +126,14 @@ fn piece(
                 }
                 file.write_all(&buffer[..count])?;
             }
-            Err(error) => return cut(at, format!("the transfer broke off: {error}"), None),
+            Err(error) => return cut(at, format!("the transfer broke off: {error}")),
         }
     }
     if at < wanted.size {
-        return cut(at, format!("the transfer ended after {at} of {} bytes", wanted.size), None);
+        return cut(at, format!("the transfer ended after {at} of {} bytes", wanted.size));
     }
     file.sync_all()?;
-    Ok(match is_right(&mut file, wanted)? {
+    Ok(match is_right(file, wanted)? {
         true => Piece::Whole,
         false => Piece::Wrong("its SHA-256 is another than the server has announced".to_string()),
     })

@@ -132,19 +132,18 @@ impl Store {
     /// In words, with the path.
     pub(super) fn save(&self, controller: &str, record: &Record) -> Result<(), String> {
         let path = self.path(controller, "json");
-        self.replace(controller, record).map_err(|error| format!("{}: {error}", path.display()))
-    }
-
-    fn replace(&self, controller: &str, record: &Record) -> io::Result<()> {
-        let text = serde_json::to_vec_pretty(record).map_err(io::Error::other)?;
-        let mut file = NamedTempFile::new_in(&self.folder)?;
-        file.write_all(&text)?;
-        file.as_file().sync_all()?;
-        file.persist(self.path(controller, "json"))?;
-        // On Windows a folder cannot be opened as a file; its file system writes names in order.
-        #[cfg(unix)]
-        File::open(&self.folder)?.sync_all()?;
-        Ok(())
+        let replace = || {
+            let text = serde_json::to_vec_pretty(record)?;
+            let mut file = NamedTempFile::new_in(&self.folder)?;
+            file.write_all(&text)?;
+            file.as_file().sync_all()?;
+            file.persist(&path)?;
+            // On Windows a folder cannot be opened as a file; its file system writes names in order.
+            #[cfg(unix)]
+            File::open(&self.folder)?.sync_all()?;
+            Ok::<_, io::Error>(())
+        };
+        replace().map_err(|error| format!("{}: {error}", path.display()))
     }
 }
 

@@ -39,44 +39,41 @@ impl Guard {
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Option<(StatusCode, &'static str)> {
+        let forbidden = |words| Some((StatusCode::FORBIDDEN, words));
         let hosts = [format!("127.0.0.1:{}", self.port), format!("localhost:{}", self.port)];
         let values = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or_default());
         if values(header::HOST).count() > 1 {
-            return Some((
-                StatusCode::BAD_REQUEST,
-                "a request must have one Host header, and this one has several",
-            ));
+            let words = "a request must have one Host header, and this one has several";
+            return Some((StatusCode::BAD_REQUEST, words));
         }
         // A foreign name that resolves to 127.0.0.1 is refused, in the header and in the request line.
         let mut names =
             values(header::HOST).chain(uri.authority().map(|authority| authority.as_str())).peekable();
         if names.peek().is_none() || !names.all(|name| hosts.iter().any(|own| own == name)) {
-            return Some((StatusCode::FORBIDDEN, "this server is only available as 127.0.0.1"));
+            return forbidden("this server is only available as 127.0.0.1");
         }
         let own_origin = |origin: &str| {
             origin.strip_prefix("http://").is_some_and(|origin| hosts.iter().any(|own| own == origin))
         };
         if !values(header::ORIGIN).all(own_origin) {
-            return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
+            return forbidden("requests from pages of another origin are refused");
         }
         // Browsers name the origin of a request: this page, or (none) the user. The page alone may be opened from
         // elsewhere: the file that leads to it is of another origin.
-        let told = |name| values(HeaderName::from_static(name)).collect::<Vec<_>>();
+        let values_of = |name| values(HeaderName::from_static(name)).collect::<Vec<_>>();
         let is_page = *method == Method::GET && uri.path().splitn(3, '/').nth(2) == Some("");
-        let sites = told("sec-fetch-site");
+        let sites = values_of("sec-fetch-site");
         let is_own = sites.iter().all(|site| matches!(*site, "same-origin" | "none"));
         let is_opened = is_page
-            && (&*told("sec-fetch-mode"), &*told("sec-fetch-dest")) == (&["navigate"], &["document"])
+            && (&*values_of("sec-fetch-mode"), &*values_of("sec-fetch-dest"))
+                == (&["navigate"], &["document"])
             && sites == ["cross-site"];
         if !is_own && !is_opened {
-            return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
+            return forbidden("requests from pages of another origin are refused");
         }
         let shown = uri.path().strip_prefix('/').and_then(|path| path.split('/').next()).unwrap_or_default();
         if !same(shown.as_bytes(), self.token.as_bytes()) {
-            return Some((
-                StatusCode::FORBIDDEN,
-                "the token is missing or wrong: open the URL that coflash has printed",
-            ));
+            return forbidden("the token is missing or wrong: open the URL that coflash has printed");
         }
         // A body with an announced length that is too large is refused before it is read.
         let mut lengths = values(header::CONTENT_LENGTH).filter_map(|len| len.parse::<u64>().ok());

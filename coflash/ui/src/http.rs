@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, FromRequest, Query, Request, State};
-use axum::http::{header, HeaderMap, StatusCode};
+use axum::http::{header, StatusCode};
 use axum::middleware;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -161,14 +161,23 @@ pub(super) fn router(
         .with_state(site)
 }
 
-/// Parses a JSON body. A form of a foreign page cannot send one.
-pub(super) fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
-    let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
-    if kind.split(';').next() != Some("application/json") {
-        let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
-        return Err(Refused::new(status, "the request is not JSON", "send it as application/json"));
+/// A JSON body. A form of a foreign page cannot send one.
+pub(super) struct Body<T>(pub(super) T);
+
+impl<T: DeserializeOwned> FromRequest<Site> for Body<T> {
+    type Rejection = Refused;
+
+    async fn from_request(request: Request, site: &Site) -> Result<Self, Refused> {
+        let kind = request.headers().get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
+        if kind.unwrap_or_default().split(';').next() != Some("application/json") {
+            let status = StatusCode::UNSUPPORTED_MEDIA_TYPE;
+            return Err(Refused::new(status, "the request is not JSON", "send it as application/json"));
+        }
+        let bytes = Bytes::from_request(request, site).await;
+        let bytes =
+            bytes.map_err(|error| Refused::new(error.status(), error.body_text(), "reload the page"))?;
+        serde_json::from_slice(&bytes).map(Self).map_err(unreadable)
     }
-    serde_json::from_slice(bytes).map_err(unreadable)
 }
 
 fn unreadable(error: impl Display) -> Refused {
@@ -244,8 +253,7 @@ pub(super) fn idle(site: &Site) -> Result<(), Refused> {
     }
 }
 
-async fn open(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Open { url } = body(&headers, &bytes)?;
+async fn open(State(site): State<Site>, Body(Open { url }): Body<Open>) -> Answer {
     idle(&site)?;
     site.shared.order(Order::Open(url.trim().to_string()))?;
     done()
@@ -295,8 +303,7 @@ struct Choice {
 }
 
 /// After a change of the settings, the file is converted again.
-async fn settings(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Choice { board, program } = body(&headers, &bytes)?;
+async fn settings(State(site): State<Site>, Body(Choice { board, program }): Body<Choice>) -> Answer {
     idle(&site)?;
     let board = match board.as_deref().filter(|board| !board.is_empty()) {
         None => None,
@@ -359,26 +366,18 @@ async fn load(site: &Site, bytes: Arc<Vec<u8>>, name: String, settings: Settings
             "report it, with the file",
         )
     };
-    match read.map_err(fault).and_then(|read| read) {
-        Ok(loaded) => {
-            let shown = loaded.shown.clone();
-            *lock(&site.shared.firmware) = Some(Arc::new(loaded));
-            site.shared.change(|state| {
-                state.firmware = Some(shown);
-                state.judge();
-            });
-            done()
-        }
-        Err(notice) => {
-            // The previous file is no longer the one that the user means.
-            *lock(&site.shared.firmware) = None;
-            site.shared.change(|state| {
-                state.firmware = None;
-                state.judge();
-            });
-            Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice))
-        }
-    }
+    let (loaded, answer) = match read.map_err(fault).and_then(|read| read) {
+        Ok(loaded) => (Some(Arc::new(loaded)), done()),
+        // The previous file is no longer the one that the user means.
+        Err(notice) => (None, Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice))),
+    };
+    let shown = loaded.as_ref().map(|loaded| loaded.shown.clone());
+    *lock(&site.shared.firmware) = loaded;
+    site.shared.change(|state| {
+        state.firmware = shown;
+        state.judge();
+    });
+    answer
 }
 
 /// Begins a task.
@@ -413,8 +412,8 @@ pub(super) fn password_of(text: &str) -> Result<Option<Password>, Refused> {
     }
 }
 
-async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Update { nodes, trial, start, renew, password } = body(&headers, &bytes)?;
+async fn update(State(site): State<Site>, Body(wanted): Body<Update>) -> Answer {
+    let Update { nodes, trial, start, renew, password } = wanted;
     let Some(file) = lock(&site.shared.firmware).clone() else {
         return Err(bad("there is no firmware file", "drop one on the page, or choose one"));
     };
@@ -459,8 +458,7 @@ struct Single {
     step: Step,
 }
 
-async fn step(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Single { node, program, step } = body(&headers, &bytes)?;
+async fn step(State(site): State<Site>, Body(Single { node, program, step }): Body<Single>) -> Answer {
     if !(1..=254).contains(&program) {
         return Err(bad("programs are 1 to 254", "choose another program"));
     }
@@ -477,8 +475,10 @@ struct Assign {
     store: bool,
 }
 
-async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Assign { address, node, bit_rate, store } = body(&headers, &bytes)?;
+async fn assign(
+    State(site): State<Site>,
+    Body(Assign { address, node, bit_rate, store }): Body<Assign>,
+) -> Answer {
     let [vendor_id, product_code, revision, serial_number] = address;
     let identity = address.map(Some);
     let address = LssAddress { vendor_id, product_code, revision, serial_number };

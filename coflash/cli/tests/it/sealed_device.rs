@@ -2,7 +2,6 @@
 
 use std::sync::{Arc, Mutex};
 
-use crate::commands::quick;
 use crate::sealing::{crc32, program, unwrapped, word, Room, START, VENDOR};
 use crate::tool::{coflash, quick, Done};
 use kit::fake::vault::Vault;

@@ -99,7 +99,7 @@ pub fn scan(
         let reported = info(&mut session);
         let found = found.entry(node).or_default();
         match reported {
-            // What it is told is a mixture of both.
+            // The answers are a mixture of both.
             _ if session.is_answered_twice()? => {
                 found.but = Some("so does a second device with this node-ID: switch one off".into())
             }

@@ -3,9 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use axum::body::Bytes;
 use axum::extract::{Query, State};
-use axum::http::{header, HeaderMap, StatusCode};
+use axum::http::{header, StatusCode};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
@@ -22,8 +21,8 @@ use super::station::{change, Stage, Station};
 use super::words::TABLE;
 use super::work::{is_due, Search, Update};
 use crate::adapters;
-use crate::http::{bad, body, done, download, idle, json_response, node_id, password_of};
-use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
+use crate::http::{bad, done, download, idle, json_response, node_id, password_of};
+use crate::http::{Answer, Body, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
 use crate::shared::Order;
 
 const FILES: [(&str, &str, &str); 11] = [
@@ -96,10 +95,8 @@ async fn describe(State(site): State<Site>, Extension(station): Extension<Arc<St
 async fn open(
     State(site): State<Site>,
     Extension(station): Extension<Arc<Station>>,
-    headers: HeaderMap,
-    bytes: Bytes,
+    Body(Open { url }): Body<Open>,
 ) -> Answer {
-    let Open { url } = body(&headers, &bytes)?;
     idle(&site)?;
     site.shared.order(Order::Open(url.trim().to_owned()))?;
     change(&site.shared, &station, |own| {
@@ -131,10 +128,9 @@ struct Confirmed {
 async fn update(
     State(site): State<Site>,
     Extension(station): Extension<Arc<Station>>,
-    headers: HeaderMap,
-    bytes: Bytes,
+    Body(confirmed): Body<Confirmed>,
 ) -> Answer {
-    let Confirmed { plan: number, nodes, password, entered } = body(&headers, &bytes)?;
+    let Confirmed { plan: number, nodes, password, entered } = confirmed;
     idle(&site)?;
     if !entered.is_text() {
         return Err(bad(

@@ -141,26 +141,13 @@ fn silence_about_an_object_costs_its_own_cell() {
 /// One object that cannot be read costs its own cell, and nothing else.
 #[test]
 fn a_refused_object_costs_its_own_cell() {
-    let objects = [
-        (0x1001, 0),
-        (0x1008, 0),
-        (0x1009, 0),
-        (0x100A, 0),
-        (0x1018, 1),
-        (0x1018, 2),
-        (0x1018, 3),
-        (0x1018, 4),
-        (0x1F51, 0),
-        (0x1F51, 1),
-        (0x1F56, 1),
-        (0x1F57, 1),
-        (0x2002, 1),
-        (0x2003, 1),
-        (0x2005, 1),
-    ];
+    let records = [(0x1018, 1..=4), (0x1F51, 0..=1)].into_iter();
+    let records = records.flat_map(|(index, subs)| subs.map(move |sub| (index, sub)));
+    let variables = [0x1001, 0x1008, 0x1009, 0x100A].map(|index| (index, 0));
+    let programs = [0x1F56, 0x1F57, 0x2002, 0x2003, 0x2005].map(|index| (index, 1));
     // Resource not available, hardware error, general error, device state, of no known meaning.
     let refusals = [0x060A_0023, 0x0606_0000, 0x0800_0000, 0x0800_0022, 0x1234_5678].map(Err);
-    for at in objects {
+    for at in records.chain(variables).chain(programs) {
         for value in refusals.iter().cloned().chain([Ok(vec![1, 2, 3, 4, 5, 6, 7, 8, 9])]) {
             let mut fake = Fake::new(BOOTLOADER);
             fake.maker = Some(Box::new(Peculiar(at, value.clone())));
@@ -177,7 +164,7 @@ fn a_refused_object_costs_its_own_cell() {
 }
 
 #[test]
-fn two_devices_with_one_node_id_are_told() {
+fn two_devices_with_one_node_id_are_noticed() {
     for count in [1, 2] {
         let mut bus = Bus((0..count).map(|_| Fake::new(BOOTLOADER)).collect());
         let found = scan(&mut bus, &ScanOptions::default().nodes(vec![node()]), &Arc::default()).unwrap();

@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use canopen::{CobId, Frame};
 use coboot_can::Adapter;
-use coboot_can::AdapterError;
 use coflash_core::device::error::Intruder;
 use coflash_core::device::Dialect;
 use coflash_core::update::event::Phase;
@@ -13,6 +12,7 @@ use coflash_core::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, 
 use coflash_core::Error;
 
 use super::{file, update};
+use crate::tap::Tap;
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const CLEAR: u8 = 0x03;
@@ -301,45 +301,22 @@ fn somebody_elses_requests_end_an_update_before_anything_is_done() {
     }
 }
 
-/// An adapter that returns sent frames; and another client's requests, from this frame on.
-struct Echo(Fake, Vec<Frame>, Option<usize>);
-
-impl Adapter for Echo {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.0.send(frame)?;
-        self.1.push(*frame);
-        if self.2.is_some_and(|from| self.0.sent.len() >= from) {
-            self.1.push(foreign(NODE));
-        }
-        Ok(())
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        if self.1.is_empty() {
-            self.0.receive(timeout)
-        } else {
-            Ok(Some(self.1.remove(0)))
-        }
-    }
-
-    fn now(&self) -> Duration {
-        self.0.now
-    }
-}
-
 #[test]
 fn an_adapters_echo_is_nobody_else() {
     for blocks in [kit::fake::Blocks::Known(127), kit::fake::Blocks::Refused(0x0504_0001)] {
         for running in [BOOTLOADER, APPLICATION] {
             let mut fake = Fake::new(running);
             fake.knows_blocks = blocks;
-            let mut echo = Echo(fake, Vec::new(), None);
+            let mut echo = Tap::sending(fake, |fake, frame| fake.inject(*frame));
             run(&mut echo, &FlashOptions::default()).0.unwrap();
             // But another client is detected over it.
-            let mut echo = Echo(Fake::new(running), Vec::new(), Some(1));
+            let mut echo = Tap::sending(Fake::new(running), |fake, frame| {
+                fake.inject(*frame);
+                fake.inject(foreign(NODE));
+            });
             let error = run(&mut echo, &FlashOptions::default()).0.unwrap_err();
             assert!(matches!(error, Error::NotAlone { .. }), "{error}");
-            assert!(echo.0.writes().is_empty());
+            assert!(echo.of.writes().is_empty());
         }
     }
 }

@@ -9,6 +9,7 @@ use coflash_core::device::{recognise, Dialect, Doing, Session, Timing, Transfers
 use coflash_core::file::block_file;
 use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::ihex;
+use coflash_core::file::read::{read, Format};
 use coflash_core::file::Target;
 use coflash_core::update::dialect::{self, read_locked};
 use coflash_core::update::event::{Note, Phase};
@@ -48,7 +49,6 @@ fn locked(phrase: &str) -> FlashOptions {
 }
 
 // --- CiA 417
-// ---------------------------------------------------------------------------------------------------------
 
 #[test]
 fn a_lift_is_unlocked_twice_moves_to_node_126_and_back() {
@@ -182,7 +182,6 @@ fn a_lift_is_read_from_its_bootloader_and_restarted() {
 }
 
 // --- ESAcademy
-// -------------------------------------------------------------------------------------------------------
 
 /// The minimal boot loader that ESAcademy describes: no status, no CRC.
 struct EsAcademy {
@@ -318,7 +317,6 @@ fn a_password_of_another_form_stops_no_application() {
 }
 
 // --- CiA 302-3
-// -------------------------------------------------------------------------------------------------------
 
 /// A device that only supports CiA 302-3. Its device type is that of its profile in both states;
 /// 1F51h shows what runs.
@@ -401,7 +399,6 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
 }
 
 // --- recognition
-// ----------------------------------------------------------------------------------------------
 
 #[test]
 fn each_is_recognised_by_what_its_document_says() {
@@ -444,7 +441,7 @@ fn intel_hex_is_written_as_its_description_has_it() {
 :100110002146017E17C20001FF5F16002148011928
 :00000001FF
 ";
-    let firmware = coflash_core::file::read::read(text.as_bytes(), None, None).unwrap();
+    let firmware = read(text.as_bytes(), None, None).unwrap();
     let written = ihex::emit(program_of(firmware, &Options::default()).unwrap().program.image());
     let lines: Vec<&str> = written.lines().collect();
     assert_eq!(lines[0], ":020000040000FA");
@@ -453,12 +450,9 @@ fn intel_hex_is_written_as_its_description_has_it() {
     let mut image = vec![0xA5; 70_003];
     image[0] = 1;
     for start in [0x0800_8001_u32, 0x0801_FFF0] {
-        let firmware =
-            coflash_core::file::read::read(&image, Some(coflash_core::file::read::Format::Raw), Some(start))
-                .unwrap();
+        let firmware = read(&image, Some(Format::Raw), Some(start)).unwrap();
         let blocks = program_of(firmware, &Options::default()).unwrap().program;
-        let again =
-            coflash_core::file::read::read(ihex::emit(blocks.image()).as_bytes(), None, None).unwrap();
+        let again = read(ihex::emit(blocks.image()).as_bytes(), None, None).unwrap();
         assert_eq!(
             block_file::emit(&program_of(again, &Options::default()).unwrap().program),
             block_file::emit(&blocks)

@@ -44,23 +44,9 @@ fn an_update_tells_its_course_and_ends_with_done() {
     let mut fake = Fake::new(APPLICATION);
     let lines = lines(&mut fake, &FlashOptions::default());
     assert_eq!(
-        course(&lines),
-        [
-            "found",
-            "phase calling_back",
-            "phase in_bootloader",
-            "note dialect",
-            "phase erasing",
-            "phase erased",
-            "progress",
-            "phase verified",
-            "phase trial_starting",
-            "phase trial_passed",
-            "phase released",
-            "phase starting",
-            "phase started",
-            "done"
-        ]
+        course(&lines).join(", "),
+        "found, phase calling_back, phase in_bootloader, note dialect, phase erasing, phase erased, progress, \
+         phase verified, phase trial_starting, phase trial_passed, phase released, phase starting, phase started, done"
     );
     for line in &lines {
         assert_eq!(line["node"], NODE, "{line}");
@@ -104,81 +90,71 @@ fn the_names_stay() {
     let seconds = Duration::from_micros(1_234_567);
     let application = DeviceType(0x0002_0192);
     let program = || json!({ "device_type": 131_474, "bootloader": false });
-    let cases: Vec<(&str, &str, Event, Value)> = vec![
-        ("found", "", Event::Found(application), program()),
-        ("progress", "", Event::Progress { done: 3, total: 9 }, json!({ "done": 3, "total": 9 })),
-        ("phase", "searching", Phase::Searching { reason: "why".into() }.into(), json!({ "reason": "why" })),
-        ("phase", "calling_back", Phase::CallingBack.into(), json!({})),
-        ("phase", "in_bootloader", Phase::InBootloader.into(), json!({})),
-        ("phase", "erasing", Phase::Erasing.into(), json!({})),
-        ("phase", "erased", Phase::Erased { took: seconds }.into(), json!({ "seconds": 1.235 })),
-        ("phase", "verified", Phase::Verified { crc: 7 }.into(), json!({ "crc": 7 })),
-        ("phase", "trial_starting", Phase::TrialStarting.into(), json!({})),
-        ("phase", "trial_passed", Phase::TrialPassed(application).into(), program()),
-        ("phase", "released", Phase::Released.into(), json!({})),
-        (
-            "phase",
-            "renewing",
-            Phase::Renewing { number: 2, from: 1, to: 65_536 }.into(),
-            json!({ "number": 2, "from": 1, "to": 65_536 }),
-        ),
-        ("phase", "staged", Phase::Staged.into(), json!({})),
-        ("phase", "on_trial", Phase::OnTrial.into(), json!({})),
-        ("phase", "installed", Phase::Installed { version: 65_536 }.into(), json!({ "version": 65_536 })),
-        ("phase", "starting", Phase::Starting.into(), json!({})),
-        ("phase", "started", Phase::Started(application).into(), program()),
-        ("phase", "verified_again", Phase::VerifiedAgain { crc: 7 }.into(), json!({ "crc": 7 })),
+    let renewing = Phase::Renewing { number: 2, from: 1, to: 65_536 };
+    let target = Target { vendor_id: 63, product_code: 2 };
+    let silence = Silence { doing: Doing::Restart, silent: seconds, limit: seconds };
+    let doing = "restarting the program";
+    let plain = [
+        ("found", Event::Found(application), program()),
+        ("progress", Event::Progress { done: 3, total: 9 }, json!({ "done": 3, "total": 9 })),
         (
             "retry",
-            "",
             Event::Retry(Retry::block(2, 1, 3, RepeatReason::Broken(AbortCode(0x0504_0001)))),
             json!({ "block": 2, "repeat": 1, "of": 3, "reason": "broken", "abort": 84_148_225 }),
         ),
         (
             "retry",
-            "",
             Event::Retry(Retry::program(1, 3, RepeatReason::NoAnswer)),
             json!({ "block": null, "repeat": 1, "of": 3, "reason": "no_answer", "abort": null }),
         ),
+    ];
+    let phases = [
+        ("searching", Phase::Searching { reason: "why".into() }, json!({ "reason": "why" })),
+        ("calling_back", Phase::CallingBack, json!({})),
+        ("in_bootloader", Phase::InBootloader, json!({})),
+        ("erasing", Phase::Erasing, json!({})),
+        ("erased", Phase::Erased { took: seconds }, json!({ "seconds": 1.235 })),
+        ("verified", Phase::Verified { crc: 7 }, json!({ "crc": 7 })),
+        ("trial_starting", Phase::TrialStarting, json!({})),
+        ("trial_passed", Phase::TrialPassed(application), program()),
+        ("released", Phase::Released, json!({})),
+        ("renewing", renewing, json!({ "number": 2, "from": 1, "to": 65_536 })),
+        ("staged", Phase::Staged, json!({})),
+        ("on_trial", Phase::OnTrial, json!({})),
+        ("installed", Phase::Installed { version: 65_536 }, json!({ "version": 65_536 })),
+        ("starting", Phase::Starting, json!({})),
+        ("started", Phase::Started(application), program()),
+        ("verified_again", Phase::VerifiedAgain { crc: 7 }, json!({ "crc": 7 })),
+    ];
+    let notes = [
+        ("target_right", Note::TargetRight(target), json!({ "vendor_id": 63, "product_code": 2 })),
+        ("dialect", Note::Dialect { dialect: Dialect::EsAcademy }, json!({ "dialect": "esacademy" })),
+        ("other_crc", Note::OtherCrc { crc: Checksum::Crc16 }, json!({ "crc": "CRC-16" })),
+        ("unlocked", Note::Unlocked, json!({})),
+        ("moved", Note::Moved { node: of(126) }, json!({ "to": 126 })),
+        ("master_taken", Note::MasterTaken { node: of(3) }, json!({ "master": 3 })),
+        ("master_back", Note::MasterBack { node: of(3) }, json!({ "master": 3 })),
+    ];
+    let warnings = [
+        ("master_kept", Warning::MasterKept { node: of(3) }, json!({ "master": 3 })),
+        ("master_missing", Warning::MasterMissing, json!({})),
+        ("covers_staging", Warning::CoversStaging { first: 0x080E_0000 }, json!({ "first": "0x080e0000" })),
         (
-            "note",
-            "target_right",
-            Note::TargetRight(Target { vendor_id: 63, product_code: 2 }).into(),
-            json!({ "vendor_id": 63, "product_code": 2 }),
-        ),
-        (
-            "note",
-            "dialect",
-            Note::Dialect { dialect: Dialect::EsAcademy }.into(),
-            json!({ "dialect": "esacademy" }),
-        ),
-        ("note", "other_crc", Note::OtherCrc { crc: Checksum::Crc16 }.into(), json!({ "crc": "CRC-16" })),
-        ("note", "unlocked", Note::Unlocked.into(), json!({})),
-        ("note", "moved", Note::Moved { node: of(126) }.into(), json!({ "to": 126 })),
-        ("note", "master_taken", Note::MasterTaken { node: of(3) }.into(), json!({ "master": 3 })),
-        ("note", "master_back", Note::MasterBack { node: of(3) }.into(), json!({ "master": 3 })),
-        ("warning", "master_kept", Warning::MasterKept { node: of(3) }.into(), json!({ "master": 3 })),
-        ("warning", "master_missing", Warning::MasterMissing.into(), json!({})),
-        (
-            "warning",
-            "covers_staging",
-            Warning::CoversStaging { first: 0x080E_0000 }.into(),
-            json!({ "first": "0x080e0000" }),
-        ),
-        (
-            "warning",
             "silent",
-            Warning::Silent(Silence { doing: Doing::Restart, silent: seconds, limit: seconds }).into(),
-            json!({ "doing": "restarting the program", "seconds": 1.235, "limit_seconds": 1.235 }),
+            Warning::Silent(silence),
+            json!({ "doing": doing, "seconds": 1.235, "limit_seconds": 1.235 }),
         ),
         (
-            "warning",
             "adapter",
-            Warning::Adapter(Losses { refused: 9, lost: 2, restarts: 1 }).into(),
+            Warning::Adapter(Losses { refused: 9, lost: 2, restarts: 1 }),
             json!({ "refused": 9, "lost": 2, "restarts": 1 }),
         ),
     ];
-    for (kind, name, event, data) in cases {
+    let plain = plain.into_iter().map(|(kind, event, data)| (kind, "", event, data));
+    let phases = phases.into_iter().map(|(name, it, data)| ("phase", name, Event::from(it), data));
+    let notes = notes.into_iter().map(|(name, it, data)| ("note", name, Event::from(it), data));
+    let warnings = warnings.into_iter().map(|(name, it, data)| ("warning", name, Event::from(it), data));
+    for (kind, name, event, data) in plain.chain(phases).chain(notes).chain(warnings) {
         let mut form = json!({ "event": kind });
         if !name.is_empty() {
             form[kind] = name.into();

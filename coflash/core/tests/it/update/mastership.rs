@@ -293,32 +293,19 @@ fn a_master_that_does_not_let_go_is_told_and_the_update_goes_on() {
 fn while_the_tool_is_the_master_it_says_so() {
     let mut network = Network::new(1, 3, Forced::Negotiates);
     // The lift's bootloader answers at node-ID 126; then somebody asks.
-    let (mut at, mut asked) = (None, false);
-    struct Asking<'n>(&'n mut Network, &'n mut Option<Duration>, &'n mut bool);
-    impl Adapter for Asking<'_> {
-        fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-            if frame.cob_id().is_some_and(|id| id.get() == 0x67E)
-                && self.0.log.contains(&">71 [0, 127]".into())
-            {
-                self.1.get_or_insert(self.0.fake.now);
-            }
-            self.0.send(frame)
+    let mut asked = false;
+    let mut asking = Tap::receiving(&mut network, |network, timeout| {
+        let is_master = network.log.contains(&">71 [0, 127]".into());
+        let lift = |sent: &Frame| sent.cob_id().is_some_and(|id| id.get() == 0x67E);
+        if !asked && is_master && network.fake.sent.iter().any(lift) {
+            asked = true;
+            network.log.push("asked".into());
+            return Ok(Some(frame(0x73, &[])));
         }
-
-        fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-            if self.1.is_some() && !*self.2 {
-                *self.2 = true;
-                self.0.log.push("asked".into());
-                return Ok(Some(frame(0x73, &[])));
-            }
-            self.0.receive(timeout)
-        }
-
-        fn now(&self) -> Duration {
-            self.0.now()
-        }
-    }
-    let (result, _) = run(&mut Asking(&mut network, &mut at, &mut asked), &options());
+        network.receive(timeout)
+    });
+    let (result, _) = run(&mut asking, &options());
+    drop(asking);
     assert!(result.is_ok(), "{result:?}");
     let at = network.log.iter().position(|entry| entry == "asked").unwrap();
     assert_eq!(network.log[at + 1], ">71 [0, 127]", "{:?}", network.log);

@@ -64,22 +64,9 @@ fn the_whole_procedure_from_a_running_application() {
     let (report, events) = run(&mut fake, FlashOptions::default());
     let report = report.unwrap();
     // Commands and their order: the manual's steps 3, 4, 6 to 9, 10, 12, 14 and 15.
-    let steps = [
-        "command 80",
-        "command 03",
-        "block 0",
-        "block 1",
-        "block 2",
-        "block 3",
-        "block 4",
-        "block -1",
-        // The trial.
-        "command 01",
-        "command 80",
-        "command 83",
-        "command 01",
-    ];
-    assert_eq!(fake.writes(), steps);
+    let steps = "command 80, command 03, block 0, block 1, block 2, block 3, block 4, block -1";
+    let trial = "command 01, command 80, command 83, command 01";
+    assert_eq!(fake.writes().join(", "), format!("{steps}, {trial}"));
     assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
     assert_eq!(fake.running, Some(APPLICATION));
     assert_eq!(

@@ -13,6 +13,8 @@ use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
+
+use crate::tap::Tap;
 use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER};
 
 /// The result of an update, and its length in virtual time.
@@ -174,26 +176,7 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
     }
 }
 
-/// A computer that sleeps for an hour in its nth wait.
-struct Sleeps(Fake, usize);
-
-impl Adapter for Sleeps {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.0.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        let frame = self.0.receive(timeout);
-        self.1 = self.1.wrapping_sub(1);
-        self.0.now += Duration::from_secs(if self.1 == 0 { 3600 } else { 0 });
-        frame
-    }
-
-    fn now(&self) -> Duration {
-        self.0.now
-    }
-}
-
+/// A computer that sleeps in its nth wait.
 #[test]
 fn an_hour_of_sleep_is_no_silence_of_the_device() {
     let running = || {
@@ -201,12 +184,22 @@ fn an_hour_of_sleep_is_no_silence_of_the_device() {
         fake.erase_time = Duration::from_secs(5);
         fake
     };
-    let mut all = Sleeps(running(), 0);
-    update(&mut all, file(), &FlashOptions::default()).0.unwrap();
-    let waits = all.1.wrapping_neg();
+    let with_sleep_in = |wait: usize| {
+        let mut waits = 0;
+        let mut sleeps = Tap::receiving(running(), |fake, timeout| {
+            let frame = fake.receive(timeout);
+            waits += 1;
+            fake.now += Duration::from_secs(if waits == wait { 3600 } else { 0 });
+            frame
+        });
+        let result = update(&mut sleeps, file(), &FlashOptions::default()).0;
+        drop(sleeps);
+        (result, waits)
+    };
+    let (_, waits) = with_sleep_in(0);
     assert!(waits > 50, "{waits}");
-    for wait in 1..=waits {
-        let result = update(&mut Sleeps(running(), wait), file(), &FlashOptions::default()).0;
+    for wait in 0..=waits {
+        let (result, _) = with_sleep_in(wait);
         assert!(result.is_ok(), "wait {wait} of {waits}: {}", result.unwrap_err());
     }
 }
