@@ -138,7 +138,7 @@ impl Store {
             file.write_all(&text)?;
             file.as_file().sync_all()?;
             file.persist(&path)?;
-            // On Windows a folder cannot be opened as a file; its file system writes names in order.
+            // Windows opens no folder as a file; its file system writes names in order.
             #[cfg(unix)]
             File::open(&self.folder)?.sync_all()?;
             Ok::<_, io::Error>(())

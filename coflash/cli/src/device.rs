@@ -153,8 +153,8 @@ pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
     Ok(flag)
 }
 
-/// What `nohup` has started outlives its terminal (POSIX): a SIGHUP that was ignored at the start is blocked in
-/// this thread, and in those that it starts.
+/// What `nohup` has started outlives its terminal (POSIX): a SIGHUP that was ignored at the start
+/// is blocked in this thread, and in those that it starts.
 #[cfg(target_os = "linux")]
 fn keep_ignored() {
     use nix::sys::signal::{SigSet, Signal};

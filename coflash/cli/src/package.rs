@@ -414,8 +414,8 @@ fn begun(plan: &Plan) -> Value {
     .collect()
 }
 
-/// Shows the outcome of each program of each device; the result of the command. `before` are the runs before this
-/// one.
+/// Shows the outcome of each program of each device; the result of the command. `before` are the
+/// runs before this one.
 fn summary(
     context: &Context,
     path: &Path,

@@ -199,7 +199,7 @@ pub(super) fn begun(devices: &Value) -> Result<(), String> {
     report.write(&[("begun", devices.clone())])
 }
 
-/// The documents of the runs before, the latest first: `report`, and those in the folder of the reports.
+/// The documents of the runs before, the latest first: `report`, and those beside this one.
 pub(super) fn before(report: Option<&Path>) -> Vec<Value> {
     let all = folder().and_then(Path::parent).and_then(|all| fs::read_dir(all).ok()).into_iter().flatten();
     let mut runs: Vec<_> = all.filter_map(|run| Some(run.ok()?.path().join(FILES[0]))).collect();
@@ -209,8 +209,8 @@ pub(super) fn before(report: Option<&Path>) -> Vec<Value> {
     runs.filter_map(|run| serde_json::from_str(&read_text(&run).ok()?).ok()).collect()
 }
 
-/// When the update of a device's program was begun that did not end: of the runs `before`, the latest with this
-/// program counts.
+/// When the update of a device's program was begun that did not end: of the runs `before`, the
+/// latest with this program counts.
 pub(super) fn unended(device: &Value, before: &[Value]) -> Option<String> {
     let is_of = |parts: &[&str], begun: &Value| parts.iter().all(|part| begun[*part] == device[*part]);
     before.iter().find_map(|run| {

@@ -44,7 +44,7 @@ pub(super) struct State {
     #[serde(serialize_with = "address")]
     pub(super) lss: Option<LssAddress>,
     pub(super) readback: Option<Readback>,
-    /// What is known of devices whose last update has failed: by node-ID, with the serial number (1018h/4).
+    /// What is known of devices whose last update has failed: by node-ID, with 1018h/4.
     #[serde(skip)]
     known: BTreeMap<u8, (Option<u32>, DeviceState)>,
     pub(super) reports: Vec<Report>,
@@ -330,7 +330,7 @@ impl State {
         }
     }
 
-    /// The state of a device after an update that has failed: if this one changed nothing, that of the one before.
+    /// The state of a device after a failed update: if it changed nothing, that of the one before.
     fn left(&mut self, node: u8, left: DeviceState) -> DeviceState {
         let serial = self.devices.as_ref().and_then(|devices| devices.get(&node)?.identity[3]);
         if left != DeviceState::Untouched {
@@ -525,7 +525,7 @@ impl Notice {
 mod tests {
     use super::*;
 
-    /// Another device at the node has not lost its program; one without an answer may be that of before.
+    /// Another device at the node has lost nothing; one without an answer may be that of before.
     #[test]
     fn what_is_known_of_a_device_is_not_known_of_another_one() {
         let mut state = State::default();

@@ -92,7 +92,7 @@ fn a_job_file_says_who_gets_what() {
     coflash(&["flash", "--job", &job, "--node", "5"]).fails(2, &["cannot be used with"]);
 }
 
-/// A device without node-ID (CiA 305) that is a bootloader as soon as it has one. It logs what it is ordered.
+/// A device without node-ID (CiA 305) that is a bootloader as soon as it has one.
 pub struct Unconfigured {
     pub fake: Fake,
     node: u8,
@@ -276,7 +276,7 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     }
 }
 
-/// A device that reports its blocks, of which the first takes some time: a signal comes in the middle.
+/// A device that reports its blocks; the first takes some time, so that a signal comes meanwhile.
 #[cfg(unix)]
 fn slow() -> (Fake, std::sync::mpsc::Receiver<u32>) {
     let mut slow = device(5, BOOTLOADER);

@@ -231,8 +231,8 @@ impl Marks {
         Ok(is_this && !self.is_of_other_date(session, number)?)
     }
 
-    /// Whether the program that runs, with the right CRC, was made at another time: 1F52h has the date of what runs,
-    /// and zeros for none.
+    /// Whether the program that runs, with the right CRC, was made at another time: 1F52h has its
+    /// date, and zeros for none.
     pub(crate) fn is_of_other_date(&self, session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
         let mut read = |index, sub| reported(session.read_number(Address::new(index, sub)));
         let has_none = self.date == [0; 2];

@@ -168,11 +168,11 @@ impl Report {
         let Of { date, entered, service, adapter, tool, .. } = &*self.of;
         let (manifest, (sha, crc)) = (service.package.manifest(), service.package.checksums());
         let word = |state: RowState| match state {
+            RowState::LeftOut => "left out",
             _ if self.kind == Kind::Begun => "begun",
             RowState::Updated => "updated",
             RowState::Has if row.interrupted.is_some() => "resumed",
             RowState::Has => "had",
-            RowState::LeftOut => "left out",
             _ => "failed",
         };
         let hex = |part: Option<u32>| part.map_or(String::new(), |part| format!("{part:08X}h"));

@@ -174,8 +174,8 @@ impl Row {
         }
     }
 
-    /// Takes a device into the update, or leaves it out. Beside a program that is due, an older one is left out:
-    /// the user has not chosen it.
+    /// Takes a device into the update, or leaves it out. Beside a program that is due, an older one
+    /// is left out: the user has not chosen it.
     pub(super) fn choose(&mut self, is_chosen: bool) {
         let wanted = self.state;
         let due = self.steps.iter_mut().map(|step| &mut step.state).chain([&mut self.state]);

@@ -93,7 +93,7 @@ pub(super) struct Update {
     pub(super) entered: Entered,
 }
 
-/// The plan for the chosen devices. Of a device without a program that is due, the older ones are chosen.
+/// The plan for the chosen devices. Where no program is due, the older ones were chosen.
 fn chosen(plan: &Plan, nodes: &BTreeSet<NodeId>) -> Plan {
     let mut plan = plan.clone();
     plan.devices.retain(|device| !is_due(device) || nodes.contains(&device.node));
@@ -205,7 +205,7 @@ mod tests {
     use super::super::row::RowState;
     use super::*;
 
-    /// Node 5 has a newer drive program and an old table, node 6 newer ones of both, node 7 as node 5.
+    /// Nodes 5 and 7 have a newer first program and an old second one, node 6 newer ones of both.
     #[test]
     fn of_older_programs_those_are_written_that_were_chosen() {
         let [five, six, seven] = [5, 6, 7].map(|node| NodeId::new(node).unwrap());

@@ -293,11 +293,12 @@ fn a_master_that_does_not_let_go_is_told_and_the_update_goes_on() {
 fn while_the_tool_is_the_master_it_says_so() {
     let mut network = Network::new(1, 3, Forced::Negotiates);
     // The lift's bootloader answers at node-ID 126; then somebody asks.
-    let mut asked = false;
+    let (mut asked, mut before) = (false, None);
     let mut asking = Tap::receiving(&mut network, |network, timeout| {
         let is_master = network.log.contains(&">71 [0, 127]".into());
-        let lift = |sent: &Frame| sent.cob_id().is_some_and(|id| id.get() == 0x67E);
-        if !asked && is_master && network.fake.sent.iter().any(lift) {
+        let lift = |sent: &&Frame| sent.cob_id().is_some_and(|id| id.get() == 0x67E);
+        let sent = network.fake.sent.iter().filter(lift).count();
+        if is_master && !asked && sent > *before.get_or_insert(sent) {
             asked = true;
             network.log.push("asked".into());
             return Ok(Some(frame(0x73, &[])));
