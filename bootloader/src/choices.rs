@@ -15,9 +15,9 @@ choices! {
     struct Start {
         /// The programs, the preferred one first: the device starts the first one that is valid,
         /// released and allowed. `InOrder` is each program, the lowest number first; a list,
-        /// `Autostart::List(&[2, 1])`; or `Autostart::Function`, which returns such a list, from a switch for
-        /// instance, in the boot stage and when 2007h/2 is read. Programs count from 1, as sub-indices do: index 0 of the
-        /// manual (`BLCOP_APP_START_INDEX`) is program 1.
+        /// `Autostart::List(&[2, 1])`; or `Autostart::Function`, which returns such a list, from a
+        /// switch for instance, under the conditions of `hooks.start_allowed`. Programs count from 1,
+        /// as sub-indices do: index 0 of the manual (`BLCOP_APP_START_INDEX`) is program 1.
         programs: Autostart = Autostart::InOrder => [Autostart::Function(|| &[1])];
         /// The number of crashes in a row after which the device stays in the bootloader, 1 to 255.
         max_crash_resets: u32 = 3 => [1];
@@ -194,7 +194,8 @@ choices! {
         erase: Option<fn(program: u8) -> Erase> = None => [Some(|_| Erase::AtOnce)];
         /// Whether a released program may be started now, for instance by a port pin
         /// (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and when
-        /// 2007h/2 is read; it must leave the peripherals as it finds them (`bsp::inputs` does).
+        /// 2007h/2 is read, while the flash may be busy: it must read no flash, return at once, and
+        /// leave the peripherals as it finds them (`bsp::inputs` does).
         start_allowed: fn(program: u8) -> bool = |_| true => [|_| bsp::inputs('C') & 1 != 0];
     };
 
