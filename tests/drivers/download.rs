@@ -83,7 +83,7 @@ fn starts(internal: &Internal, serial: &Serial) -> Option<Vec<u8>> {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let verified = verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, SERIAL).ok()?;
     let bytes = serial.cells.model().cells(REGION)[..1024].to_vec();
-    verified.signed().then_some(bytes)
+    verified.signed.then_some(bytes)
 }
 
 #[test]

@@ -185,7 +185,7 @@ mod tests {
         let files = Files::open(&folder, &CHIP).unwrap();
         let journal = Journal::open(&files, LAYOUT.parameters);
         let found = verify(&files, &journal, &LAYOUT, CrcKind::Crc32, 1).unwrap();
-        assert!(found.signed());
+        assert!(found.signed);
         let mut bytes = vec![0; image.len()];
         files.read(LAYOUT.programs[0].base, &mut bytes);
         assert!(bytes == image);

@@ -181,7 +181,7 @@ fn without_its_right_a_program_is_not_lost() {
             assert_eq!(host.status(1), 0x84, "NO_ACCESS");
         });
     }
-    assert!(device.verified(1).is_ok_and(|program| program.signed()));
+    assert!(device.verified(1).is_ok_and(|program| program.signed));
     // Each with its own.
     device.run(|host| {
         assert!(host.grant(&keys().root, right::CLEAR_SIGNATURE, 0));
@@ -190,7 +190,7 @@ fn without_its_right_a_program_is_not_lost() {
         assert!(host.command(1, CLEAR).is_err());
         assert_eq!(host.commanded(1, CLR_SIGNATURE), 0);
     });
-    assert!(device.verified(1).is_ok_and(|program| !program.signed()));
+    assert!(device.verified(1).is_ok_and(|program| !program.signed));
     device.run(|host| {
         assert!(host.grant(&keys().root, right::ERASE, 0));
         assert!(host.command(1, CLR_SIGNATURE).is_err());
@@ -322,7 +322,7 @@ fn the_flash_is_locked_unless_the_owner_has_signed_otherwise() {
         let device = Device::sealed(&STANDARD_1);
         let file = seal(&Sealer { writes_flash, ..sealer((false, false)) }, &program(1));
         device.run(|host| host.install(1, &file));
-        let is_locked = |device: &Device| device.verified(1).map(|program| program.locks_flash());
+        let is_locked = |device: &Device| device.verified(1).map(|program| program.locks_flash);
         assert_eq!(is_locked(&device).ok(), Some(!writes_flash));
         // Also where its release for autostart is stored anew.
         device.run(|host| {
@@ -333,5 +333,5 @@ fn the_flash_is_locked_unless_the_owner_has_signed_otherwise() {
     }
     let device = Device::open(&STANDARD_1);
     device.run(|host| host.install(1, &program(1)));
-    assert_eq!(device.verified(1).map(|program| program.locks_flash()).ok(), Some(false));
+    assert_eq!(device.verified(1).map(|program| program.locks_flash).ok(), Some(false));
 }

@@ -139,7 +139,7 @@ fn a_stranger_cannot_wear_out_the_journal() {
         // Three refusals, and a wrong signature.
         assert_eq!(stored, 4 * SLOT_WORDS, "{}", setup.name);
         for program in 1..=setup.programs() {
-            assert!(setup.is_data(program) || device.verified(program).is_ok_and(|program| program.signed()));
+            assert!(setup.is_data(program) || device.verified(program).is_ok_and(|program| program.signed));
         }
         assert!(!device.run(|host| host.node.is_finishing()));
     }
@@ -376,7 +376,7 @@ fn a_key_that_is_revoked_signs_for_no_program() {
 #[test]
 fn a_withdrawal_is_undone_by_its_right_alone() {
     let device = device_with_programs(&STANDARD_1);
-    let is_released = |device: &Device| device.verified(1).is_ok_and(|program| program.signed());
+    let is_released = |device: &Device| device.verified(1).is_ok_and(|program| program.signed);
     assert!(is_released(&device));
     device.run(|host| {
         assert_eq!(host.commanded(1, SET_SIGNATURE), 0, "nothing changes");

@@ -31,7 +31,7 @@ use {canopen::program::ACCESS, seal::access::right};
 use crate::choices::Has;
 pub use crate::choices::{Choices, Everything, Extras, PasswordObject};
 use crate::control::{Downloader, Policy, Sealed, Step};
-use crate::decision::{next_stay, Outlook};
+use crate::decision::next_stay;
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
@@ -293,12 +293,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// 2007h/2: what the boot stage would choose after a power-on now.
     fn next_stay(&self) -> u8 {
         let [_, reason, _, crash_resets, _] = self.state;
-        let outlook = Outlook {
-            strap: C::entry_strap(reason == Reason::Strap as u8),
-            crash_resets: crash_resets.into(),
-            node_id: self.node.id_or_none(),
-        };
-        next_stay(outlook, C::DECISION, &self.download).map_or(STATE_STARTS, |reason| reason as u8)
+        let strap = C::entry_strap(reason == Reason::Strap as u8);
+        let node_id = self.node.id_or_none();
+        next_stay(strap, crash_resets.into(), node_id, C::DECISION, &self.download)
+            .map_or(STATE_STARTS, |reason| reason as u8)
     }
 
     /// Whether [`Bootloader::step`] has work to do.

@@ -16,7 +16,7 @@ use shared_abi::warm_start::{BootRequest, Damage, Owed, TrialStep};
 
 use crate::crc::CrcKind;
 use crate::flash::Flash;
-use crate::program::{verify, Invalid};
+use crate::program::{verify, Invalid, VerifiedProgram};
 use crate::renewal::Places;
 use crate::store::{Key, Parameters, RenewalRecord};
 
@@ -258,7 +258,7 @@ pub struct Start<V = VectorTable> {
     /// The program starts once without a release.
     pub trial: bool,
     /// The flash is locked before, until the next reset
-    /// ([`locks_flash`](crate::program::VerifiedProgram::locks_flash)).
+    /// ([`VerifiedProgram::locks_flash`]).
     pub locks_flash: bool,
 }
 
@@ -451,21 +451,16 @@ pub fn choose<I>(
     Choice { store, waits, damage, exit }
 }
 
-/// What a bootloader knows of the next reset.
-#[derive(Clone, Copy, Debug)]
-pub struct Outlook {
-    /// The entry strap asks for the bootloader.
-    pub strap: bool,
-    /// The number of consecutive crash resets, as stored.
-    pub crash_resets: u32,
-    /// The node-ID that is valid from this reset on; 255 for none.
-    pub node_id: u8,
-}
-
-/// Why a power-on would leave the device in the bootloader, by the rules of [`choose`]; `None` if a program would
-/// start, after its rescue window perhaps.
-pub fn next_stay(outlook: Outlook, product: impl Product, contents: impl Contents) -> Option<Reason> {
-    let Outlook { strap, crash_resets, node_id } = outlook;
+/// Why a power-on would leave the device in the bootloader, by the rules of [`choose`]; `None` if a
+/// program would start, after its rescue window perhaps. `crash_resets` is the number as stored,
+/// `node_id` that of the device, 255 for none.
+pub fn next_stay(
+    strap: bool,
+    crash_resets: u32,
+    node_id: u8,
+    product: impl Product,
+    contents: impl Contents,
+) -> Option<Reason> {
     let programs = Programs { node_id, product, contents };
     match programs.decide(Asked { request: None, strap, crash_resets }) {
         Err(Stay { reason, held: 0, .. }) => Some(reason),
@@ -508,7 +503,7 @@ pub trait Contents {
     ///
     /// # Errors
     /// [`Reason::NoProgram`], or what is wrong with it.
-    fn check(&self, product: impl Product, number: u8) -> Result<Sound<Self::Vectors>, Reason>;
+    fn check(&self, product: impl Product, number: u8) -> Result<VerifiedProgram<Self::Vectors>, Reason>;
 
     /// As [`Parameters::is_nearly_full`].
     fn is_nearly_full(&self) -> bool {
@@ -525,37 +520,18 @@ struct Stored<'a, F, S> {
 impl<F: Flash, S: Parameters> Contents for Stored<'_, F, S> {
     type Vectors = VectorTable;
 
-    fn check(&self, product: impl Product, number: u8) -> Result<Sound<VectorTable>, Reason> {
+    fn check(&self, product: impl Product, number: u8) -> Result<VerifiedProgram, Reason> {
         let Policy { layout, crc, .. } = *product.policy();
-        match verify(self.flash, self.parameters, layout, crc, number) {
-            Ok(program) => Ok(Sound {
-                signed: program.signed(),
-                confirmed: program.confirmed(),
-                locks_flash: program.locks_flash(),
-                vectors: program.vectors(),
-            }),
-            Err(Invalid::NoSuchProgram | Invalid::Absent) => Err(Reason::NoProgram),
-            Err(Invalid::Size | Invalid::Crc) => Err(Reason::Damaged),
-            Err(Invalid::Vectors(_)) => Err(Reason::Vectors),
-        }
+        verify(self.flash, self.parameters, layout, crc, number).map_err(|invalid| match invalid {
+            Invalid::NoSuchProgram | Invalid::Absent => Reason::NoProgram,
+            Invalid::Size | Invalid::Crc => Reason::Damaged,
+            Invalid::Vectors(_) => Reason::Vectors,
+        })
     }
 
     fn is_nearly_full(&self) -> bool {
         self.parameters.is_nearly_full()
     }
-}
-
-/// A program whose contents are good.
-#[derive(Clone, Copy, Debug)]
-pub struct Sound<V> {
-    /// Whether it is released for autostart.
-    pub signed: bool,
-    /// Whether it starts without a rescue window.
-    pub confirmed: bool,
-    /// Whether the flash is locked before its start.
-    pub locks_flash: bool,
-    /// The proof of its checks.
-    pub vectors: V,
 }
 
 /// The inputs of a decision that a damaged RAM image changes.
@@ -669,7 +645,7 @@ impl<P: Product, C: Contents> Programs<P, C> {
         }
     }
 
-    fn check(&self, number: u8) -> Result<Sound<C::Vectors>, Reason> {
+    fn check(&self, number: u8) -> Result<VerifiedProgram<C::Vectors>, Reason> {
         let Policy { layout, programs, .. } = *self.product.policy();
         // Data of the profile are no program.
         if programs.len() < layout.programs.len() && !programs.contains(&number) {

@@ -67,47 +67,18 @@ pub enum Invalid {
     Vectors(VectorFault),
 }
 
-/// A program that has passed every check of its contents. Only [`verify`] makes this value.
+/// A program that has passed every check of its contents.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct VerifiedProgram {
-    vectors: VectorTable,
-    number: u8,
-    signed: bool,
-    confirmed: bool,
-    locks_flash: bool,
-}
-
-impl VerifiedProgram {
-    /// 1 to 254.
-    #[must_use]
-    pub const fn number(&self) -> u8 {
-        self.number
-    }
-
-    /// Whether the program is released for autostart.
-    #[must_use]
-    pub const fn signed(&self) -> bool {
-        self.signed
-    }
-
-    /// Whether the program has proved that it can return to the bootloader, so that it starts
-    /// without a rescue window.
-    #[must_use]
-    pub const fn confirmed(&self) -> bool {
-        self.confirmed
-    }
-
-    /// Whether the flash must be locked until the next reset before the program starts.
-    #[must_use]
-    pub const fn locks_flash(&self) -> bool {
-        self.locks_flash
-    }
-
-    /// The vectors for the jump.
-    #[must_use]
-    pub const fn vectors(&self) -> VectorTable {
-        self.vectors
-    }
+pub struct VerifiedProgram<V = VectorTable> {
+    /// For the jump: the proof of the checks, by [`verify`]; `()` where it is not started.
+    pub vectors: V,
+    /// Whether it is released for autostart.
+    pub signed: bool,
+    /// Whether it has proved that it can return to the bootloader, so that it starts without a
+    /// rescue window.
+    pub confirmed: bool,
+    /// Whether the flash must be locked until the next reset before it starts.
+    pub locks_flash: bool,
 }
 
 /// Checks the vector table at the start of a program's flash.
@@ -148,5 +119,5 @@ pub fn verify<F: Flash>(
         return Err(Invalid::Crc);
     }
     let ProgramRecord { signed, confirmed, seal, .. } = record;
-    Ok(VerifiedProgram { vectors, number, signed, confirmed, locks_flash: seal == Some(Seal::Locked) })
+    Ok(VerifiedProgram { vectors, signed, confirmed, locks_flash: seal == Some(Seal::Locked) })
 }

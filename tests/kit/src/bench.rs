@@ -16,7 +16,7 @@ use crate::boot::{leaked, Boot};
 use crate::rig::go_on;
 pub use crate::rig::{block, crc32};
 
-use crate::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use crate::model::{ModelFlash, CHIP, ONE_PROGRAM};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
 pub static LAYOUT_REF: &Layout = &LAYOUT;
@@ -230,43 +230,9 @@ pub fn program(len: usize, seed: u8) -> Vec<u8> {
 pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
     let journal = Journal::open(flash, LAYOUT.parameters);
     let verified = verify(flash, &journal, &LAYOUT, CrcKind::Crc32, 1)?;
-    if verified.signed() {
+    if verified.signed {
         Ok(flash.cells(PROGRAM)[8] ^ 8_u8.wrapping_mul(31))
     } else {
         Err(Invalid::Absent)
     }
-}
-
-/// An update of an installed program, cut at every operation: afterwards the old program or the new
-/// one starts (identified by their seeds), complete, or none; and the update then completes.
-pub fn cut_at_every_operation(installed: &ModelFlash, old: u8, new: u8, update: impl Fn(&mut ModelFlash)) {
-    let cells = installed.cells(CHIP.flash).to_vec();
-    let fresh = || {
-        let mut flash = ModelFlash::new(&CHIP);
-        flash.poke(CHIP.flash.base, &cells);
-        flash
-    };
-    assert_eq!(autostart(&fresh()), Ok(old));
-    let mut flash = fresh();
-    update(&mut flash);
-    let operations = flash.operations;
-    assert!(operations > 80, "{operations}");
-    let mut seen = [0; 3];
-    for operation in 1..=operations {
-        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
-            let mut flash = fresh();
-            flash.cut = Some((operation, cut));
-            assert!(until_power_cut(|| update(&mut flash)));
-            flash.power_on();
-            match autostart(&flash) {
-                Ok(seed) if seed == old => seen[0] += 1,
-                Ok(seed) if seed == new => seen[1] += 1,
-                Err(_) => seen[2] += 1,
-                other => panic!("cut {cut:?} at operation {operation}: {other:?} would start"),
-            }
-            update(&mut flash);
-            assert_eq!(autostart(&flash), Ok(new), "cut {cut:?} at operation {operation}");
-        }
-    }
-    assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
 }

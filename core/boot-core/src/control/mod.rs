@@ -30,12 +30,12 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use crate::choices::{Choices, Everything, Has};
-use crate::decision::{Contents, Product, Sound};
+use crate::decision::{Contents, Product};
 use crate::flash::Flash;
 use crate::intake::Intake;
 use crate::keys::Images;
 use crate::policy::Judge;
-use crate::program::{check_vectors, Expected};
+use crate::program::{check_vectors, Expected, VerifiedProgram};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::renewal::Known;
@@ -587,11 +587,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize, C: Choices> Downloader<'b, P, PRO
 impl<P: Parameters, const PROGRAMS: usize, C: Choices> Contents for &Downloader<'_, P, PROGRAMS, C> {
     type Vectors = ();
 
-    fn check(&self, _: impl Product, number: u8) -> Result<Sound<()>, Reason> {
+    fn check(&self, _: impl Product, number: u8) -> Result<VerifiedProgram<()>, Reason> {
         let state = self.program(number).ok_or(Reason::NoProgram)?;
         match &state.record {
             &Some(ProgramRecord { signed, confirmed, .. }) => {
-                Ok(Sound { signed, confirmed, locks_flash: false, vectors: () })
+                Ok(VerifiedProgram { signed, confirmed, locks_flash: false, vectors: () })
             }
             None => Err(state.absent),
         }

@@ -84,7 +84,7 @@ fn file_with_crc16(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {
 /// Whether the boot stage of a product with this CRC would start it.
 fn starts(flash: &ModelFlash, kind: CrcKind) -> Result<bool, Invalid> {
     let journal = Journal::open(flash, LAYOUT.parameters);
-    verify(flash, &journal, LAYOUT_REF, kind, 1).map(|program| program.signed())
+    verify(flash, &journal, LAYOUT_REF, kind, 1).map(|program| program.signed)
 }
 
 /// CRC of the digits 1 to 9, from the CRC catalogue (CRC-32/ISO-HDLC and CRC-16/XMODEM, "check"): computed by
@@ -421,20 +421,6 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     }
 }
 
-/// An update, cut at every operation: afterwards the old program or the new one starts, complete,
-/// or none; and the update then completes.
-#[test]
-fn an_update_cut_anywhere_leaves_the_old_the_new_or_no_program() {
-    let (old, new) = (program(200, 0xA0), program(300, 0xB0));
-    let mut installed = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut installed);
-    bench.release(&old);
-    cut_at_every_operation(&installed, 0xA0, 0xB0, |flash| {
-        let mut bench = Bench::new(flash);
-        bench.release(&new);
-    });
-}
-
 /// Control block with identity: application size, vendor-ID, product code (SYS TEC manual, table
 /// 6).
 fn control(app_size: u32, vendor_id: u32, product_code: u32) -> Vec<u8> {
@@ -727,7 +713,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
         !flash.touched.iter().any(|at| nv.iter().any(|nv| nv.contains(at.base, 1))),
         "the journal's sectors"
     );
-    assert!(verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed());
+    assert!(verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed);
 
     eeprom.fails = true;
     let mut device: Downloader<'_, _, 1> =
@@ -735,7 +721,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
     device.command(1, ProgramControl::ClrSignature).unwrap();
     assert_eq!(settle(&mut device, &mut flash), 0x10, "NVDATA");
     assert!(
-        verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed(),
+        verify(&flash, &&mut eeprom, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed,
         "the old value is still there"
     );
 }

@@ -423,22 +423,6 @@ fn the_flash_fails_under_a_stream() {
     assert!(found.contains(&(Err(AbortCode(0x0800_0000)), 0x0A)), "{found:?}");
 }
 
-/// An update by raw image or HEX, cut at every operation: the old program, the new one, or none.
-#[test]
-fn a_stream_cut_anywhere_leaves_the_old_the_new_or_no_program() {
-    let (old, new) = (program(200, 0xD0), program(300, 0xE0));
-    let mut installed = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut installed);
-    bench.release(&old);
-    for data in [new.clone(), hex(&new, 16, "\n").into_bytes()] {
-        cut_at_every_operation(&installed, 0xD0, 0xE0, |flash| {
-            let mut bench = Bench::new(flash);
-            assert_eq!(bench.command(CLEAR), 0);
-            assert_eq!(bench.stream(&data, None, 7), (Ok(()), 0));
-        });
-    }
-}
-
 /// The ESAcademy profile: locked until the password arrives; after a wrong password the device
 /// refuses every attempt for a time.
 #[test]
