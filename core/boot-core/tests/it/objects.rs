@@ -433,13 +433,10 @@ fn who_writes_an_object_of_an_update_holds_the_device() {
 }
 
 /// A bootloader with this report of the boot stage.
-fn reported<'f>(
-    flash: &'f mut ModelFlash,
-    config: &'static Config,
-    report: BootReport,
-) -> Bootloader<'static, &'f mut ModelFlash, Journal, 1> {
+fn reported(flash: &mut ModelFlash, config: Config, node: NodeParameters, report: BootReport) -> Bench<'_> {
     let (buffer, sealed) = leaked(256);
-    Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), report }.on(flash, buffer, sealed)
+    let config = Box::leak(Box::new(config));
+    Bench { node: Boot { config, serial_number: 0x1234_5678, node, report }.on(flash, buffer, sealed) }
 }
 
 /// A bootloader of a product with these choices.
@@ -491,18 +488,15 @@ fn the_end_of_work_is_told_by_an_emergency() {
 #[test]
 fn a_device_tells_why_it_stayed() {
     let messages = |reason: u8, boot_up_emergency| {
-        let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
-        let mut node = reported(new_flash(), config, BootReport { reason, ..BootReport::NONE });
+        let config = Config { boot_up_emergency, ..CONFIG };
+        let report = BootReport { reason, ..BootReport::NONE };
+        let mut bench = reported(new_flash(), config, kit::bench::node(), report);
+        // Vendor-ID, product code and revision are those of the configuration.
+        let identity = [1, 2, 3, 4].map(|sub| bench.word(Address::new(0x1018, sub)));
+        assert_eq!(identity, [0, 0, 0, 0x1234_5678]);
+        let node = &mut bench.node;
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
-        let mut bytes = [0; 4];
-        assert_eq!(node.read(Address::new(0x1018, 4), &mut bytes), Ok(4));
-        assert_eq!(bytes, 0x1234_5678_u32.to_le_bytes());
-        // Vendor-ID, product code and revision are those of the configuration.
-        for sub in 1..4 {
-            assert_eq!(node.read(Address::new(0x1018, sub), &mut bytes), Ok(4));
-            assert_eq!(bytes, [0; 4]);
-        }
         node.node_id_changed(None);
         let before = [node.next_emergency(), node.next_emergency()];
         node.node_id_changed(NodeId::new(5));
@@ -580,14 +574,10 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         let refused = u8::from([9, 10].contains(&now));
         let reason = if refused > 0 { now } else { last };
         let report = BootReport { reason, crash_resets, refused, ..BootReport::NONE };
-        let (buffer, sealed) = leaked(256);
         let node = NodeParameters { id: NodeId::new(id), ..kit::bench::node() };
-        let mut node: Bootloader<'_, _, _, 1> =
-            Boot { config: &CONFIG, serial_number: 1, node, report }.on(&mut flash, buffer, sealed);
-        node.node_id_changed(NodeId::new(5));
-        let mut byte = [0];
-        assert_eq!(node.read(Address::new(0x2007, 2), &mut byte), Ok(1));
-        assert_eq!(byte, [now], "after {last}");
+        let mut bench = reported(&mut flash, CONFIG, node, report);
+        bench.node.node_id_changed(NodeId::new(5));
+        assert_eq!(bench.word(Address::new(0x2007, 2)), now.into(), "after {last}");
     }
     let report = BootReport {
         reason: Reason::Unsigned as u8,
@@ -595,15 +585,13 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         crash_resets: 3,
         ..BootReport::NONE
     };
-    let mut node = reported(new_flash(), &CONFIG, report);
+    let mut bench = reported(new_flash(), CONFIG, kit::bench::node(), report);
     for (sub, value) in [(1, 0), (2, 2), (11, 5), (3, 4), (4, 3)] {
         let mut byte = [0xEE];
-        assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
+        assert_eq!(bench.node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
         assert_eq!(byte, [value], "2007h/{sub}");
     }
-    let mut word = [0xEE; 4];
-    assert_eq!(node.read(Address::new(0x2007, 10), &mut word), Ok(4));
-    assert_eq!(word, [0; 4]);
+    assert_eq!(bench.word(Address::new(0x2007, 10)), 0);
 }
 
 /// A START that came to nothing after the reset: 1F57h is 02h for that program. A damaged program is
@@ -622,12 +610,8 @@ fn a_start_that_the_boot_stage_refused_is_no_valid_program() {
             rig.install(1, &raw(&STANDARD_1, 1, 700));
             let mut flash = rig.chip.model().clone();
             let report = BootReport { reason: reason as u8, refused, ..BootReport::NONE };
-            let mut node = reported(&mut flash, &CONFIG, report);
-            let mut read = |index| {
-                let mut bytes = [0; 4];
-                node.read(Address::new(index, 1), &mut bytes).unwrap();
-                u32::from_le_bytes(bytes)
-            };
+            let mut bench = reported(&mut flash, CONFIG, kit::bench::node(), report);
+            let mut read = |index| bench.word(Address::new(index, 1));
             let is_named = refused == 1;
             assert_eq!(read(0x1F57), if is_named { 0x02 } else { 0 }, "{reason:?}, program {refused}");
             let is_there = stays || !is_named;
