@@ -8,10 +8,8 @@ use rtic::Mutex;
 use crate::entries::PDOS;
 use crate::process::OWN;
 
-/// The identifiers that the slave accepts.
-const OF_SLAVE: usize = 4;
-/// With SYNC, those of the RPDOs (each PDO has room), and those of the application.
-const IDENTIFIERS: usize = OF_SLAVE + 1 + PDOS.len() + OWN.len();
+/// Those that the slave accepts, SYNC, those of the RPDOs (each PDO has room) and of the application.
+const IDENTIFIERS: usize = 4 + 1 + PDOS.len() + OWN.len();
 
 /// Carries out the slave's actions until there are none left.
 pub fn carry_out(
@@ -29,9 +27,9 @@ pub fn carry_out(
 }
 
 /// All identifiers to accept; the first one again in the place of a PDO that does not exist.
-fn identifiers(of_slave: [CobId; OF_SLAVE], device: &mut impl SlaveDevice) -> [u16; IDENTIFIERS] {
+fn identifiers(of_slave: [CobId; 4], device: &mut impl SlaveDevice) -> [u16; IDENTIFIERS] {
     core::array::from_fn(|n| {
-        let own = || device.exchange()?.identifier(n - OF_SLAVE);
+        let own = || device.exchange()?.identifier(n - of_slave.len());
         of_slave.get(n).copied().or_else(own).unwrap_or(of_slave[0]).get()
     })
 }

@@ -223,7 +223,7 @@ impl SlaveDevice for Application {
 
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
-        self.pdos.reset(id);
+        self.pdos = Pdos::new(&PDOS, id);
         self.process.state_changed(NmtState::Initialisation);
         self.control.node_id_changed(id.map(NodeId::get));
     }

@@ -322,7 +322,6 @@ impl Pdo {
 /// SYNC, and the `N` PDOs of a device.
 #[derive(Clone, Debug)]
 pub struct Pdos<const N: usize> {
-    presets: &'static [Preset; N],
     sync: CobId,
     /// The last SYNC had data.
     sync_has_data: bool,
@@ -334,20 +333,14 @@ pub struct Pdos<const N: usize> {
 impl<const N: usize> Pdos<N> {
     /// All is as after a reset of communication with this node-ID; without one, no PDO exists.
     #[must_use]
-    pub fn new(presets: &'static [Preset; N], id: Option<NodeId>) -> Self {
+    pub fn new(presets: &[Preset; N], id: Option<NodeId>) -> Self {
         Self {
-            presets,
             sync: const { CobId::new(0x080).unwrap() },
             sync_has_data: false,
             pdos: array::from_fn(|n| Pdo::new(&presets[n], id)),
             is_operational: false,
             identifiers_changed: false,
         }
-    }
-
-    /// The communication was reset, with this node-ID.
-    pub fn reset(&mut self, id: Option<NodeId>) {
-        *self = Self::new(self.presets, id);
     }
 
     /// The COB-IDs of SYNC and of the RPDOs that exist.

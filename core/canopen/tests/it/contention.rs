@@ -61,7 +61,6 @@ fn a_lost_last_segment_is_acknowledged_after_50_ms_and_a_pause_after_250() {
     for (segments, pause) in [(1, 250), (40, 250), (125, 250), (126, 50)] {
         let mut bench = Bench::with(Config::DEFAULT);
         bench.begin(segments);
-        assert_eq!(bench.server.next_deadline(), Some(at(pause)), "{segments}");
         assert_eq!(bench.wait(300), [(pause, response(acked(segments)))], "{segments}");
         // The client repeats the missing part. The end of the transfer may be lost as well.
         assert_eq!(bench.ask([1, 1, 2, 3, 4, 5, 6, 7]), []);
@@ -480,9 +479,6 @@ fn a_download_that_makes_no_progress_times_out() {
                 sent.extend(bench.wait(every));
                 noise[7] ^= 1;
                 bench.ask(noise);
-                // A frame that was examined is not examined again.
-                let wakes = bench.server.next_deadline();
-                assert!(wakes.is_none_or(|wakes| !at(bench.now).has_reached(wakes)), "{noise:02X?}");
             }
             let (when, last) = sent.last().unwrap();
             assert_eq!(*last, response(TIMED_OUT));

@@ -108,8 +108,8 @@ fn frames_of_every_kind_and_length_arrive_in_operational_alone() {
         (4, 4, Some(0x8220)),
         (8, 8, None),
     ] {
-        let told = bench.put(0x205, &[len; 8][..len.into()]);
-        assert_eq!((bench.byte(), told), (byte, emergency), "{len} bytes");
+        let said = bench.put(0x205, &[len; 8][..len.into()]);
+        assert_eq!((bench.byte(), said), (byte, emergency), "{len} bytes");
     }
     bench.pdos.state_changed(PreOperational);
     bench.now = 100;
@@ -137,7 +137,7 @@ fn synchronous_pdos_wait_for_sync() {
     }
     // Type 0: only after an event.
     assert_eq!(bench.write(0x1800, 2, 0), 0);
-    for (id, input, told, expected) in [
+    for (id, input, fault, expected) in [
         (SYNC, 7, None, tpdo(7)),
         (SYNC, 7, None, None),
         (SYNC, 8, Some(0x8240), tpdo(8)),
@@ -151,7 +151,7 @@ fn synchronous_pdos_wait_for_sync() {
         bench.input(input);
         // Frames with a counter, which the device does not have.
         let data: &[u8] = if matches!(input, 8 | 9) && id == SYNC { &[1] } else { &[] };
-        assert_eq!((bench.put(id, data), bench.sent()), (told, expected), "{input}");
+        assert_eq!((bench.put(id, data), bench.sent()), (fault, expected), "{input}");
     }
 }
 
@@ -233,7 +233,7 @@ fn a_pdo_is_changed_by_the_procedure_of_the_standard_alone() {
     assert_eq!((bench.byte(), &bench.process.0[&0x2001][..]), (6, &[0x34, 0x12][..]));
 
     // Reset communication: all is as after a power-on, and as the table says.
-    bench.pdos.reset(Some(node()));
+    bench.pdos = Pdos::new(&PRESETS, Some(node()));
     assert_eq!(read(&mut bench.pdos), (0x4000_0185, vec![SYNC, 0x205]));
     let default = |index| find(&TABLE, Address::new(index, 1)).unwrap().default;
     assert_eq!(default(0x1800), DefaultValue::Text("$NODEID+0x40000180"));

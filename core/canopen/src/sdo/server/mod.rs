@@ -224,18 +224,6 @@ impl SdoServer {
         self.config.bit_rate = bit_rate;
     }
 
-    /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
-    /// never.
-    #[must_use]
-    pub fn next_deadline(&self) -> Option<Instant> {
-        let timeout = self.moved + self.config.timeout_ms;
-        match &self.state {
-            State::Idle => None,
-            _ if self.is_within() => Some(timeout.earlier(self.heard + self.pause_ms())),
-            _ => Some(timeout),
-        }
-    }
-
     /// The segments that follow are those of a new download of this client, or it has aborted.
     fn forget_under_way(&mut self) {
         let response = self.response;
