@@ -3,13 +3,13 @@
 use std::env;
 use std::fmt::Write as _;
 use std::fs::File;
-use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use coboot_app::callgate::{Callgate, CallgateError, Table};
 use shared_abi::handoff::{BootInfo, Handoff};
 use shared_abi::nameplate::Nameplate;
 
+use crate::compiler::{compile_for_the_chip, strict, succeed};
 use crate::layout::{golden, named, of_bytes};
 use crate::old_and_new::records;
 
@@ -94,33 +94,12 @@ int main(void)
 }
 "#;
 
-pub fn include() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot")
-}
-
-/// What a program for the chip takes from the header and from the library.
-fn for_the_chip() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../abi/for_the_chip.c")
-}
-
-/// A compiler that takes nothing lightly.
-fn strict(compiler: &str) -> Command {
-    let mut compiler = Command::new(compiler);
-    compiler.args(["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wcast-align", "-Werror"]);
-    compiler.arg("-I").arg(include());
-    compiler
+fn name_of_clang() -> String {
+    env::var("CLANG").unwrap_or_else(|_| "clang".into())
 }
 
 pub fn clang() -> Command {
-    strict(&env::var("CLANG").unwrap_or_else(|_| "clang".into()))
-}
-
-pub fn succeed(command: &mut Command) -> String {
-    let output = command.output().unwrap_or_else(|error| {
-        panic!("{command:?}: {error}. `cargo xtask setup` installs the compilers.");
-    });
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout).unwrap()
+    strict(&name_of_clang())
 }
 
 /// What the library for Rust makes of a record, as the program prints it.
@@ -201,17 +180,10 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
     }
 }
 
-/// As C and as C++, as freestanding as it gets: the assertions on sizes and offsets hold there, too. For both
-/// float ABIs of the chip; `by_gcc.rs` does the same with the other compiler.
+/// For both float ABIs of the chip; `by_gcc.rs` does the same with the other compiler.
 #[test]
 fn it_compiles_for_the_chip() {
-    let folder = kit::folder!("header-for-the-chip");
-    for language in [["-xc", "-std=c11"], ["-xc", "-std=gnu17"], ["-xc++", "-std=c++17"]] {
-        for target in ["thumbv7em-none-eabihf", "thumbv7em-none-eabi"] {
-            let mut clang = clang();
-            clang.arg(format!("--target={target}")).args(language);
-            clang.args(["-mcpu=cortex-m4", "-ffreestanding", "-Os", "-c"]).arg(for_the_chip());
-            succeed(clang.arg("-o").arg(folder.join("chip.o")));
-        }
+    for target in ["thumbv7em-none-eabihf", "thumbv7em-none-eabi"] {
+        compile_for_the_chip(&name_of_clang(), &format!("--target={target}"));
     }
 }

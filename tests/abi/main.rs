@@ -3,6 +3,7 @@
 //! and with the figures of others. It needs no image and no emulator.
 
 mod compare;
+mod compiler;
 mod header;
 mod layout;
 mod manuals;

@@ -7,7 +7,8 @@ use std::process::Command;
 use coboot_app::departure::{Departure, Next};
 use kit::random::Random;
 
-use crate::header::{clang, include, succeed};
+use crate::compiler::{include, succeed};
+use crate::header::clang;
 
 /// Reads a script of events, and prints what the program does about each: for `b REQUEST NOW`, a command
 /// that was taken, whether it is possible; for `p QUIET NOW`, the next step, and in the end the request.
