@@ -1,6 +1,6 @@
 //! The device on the bus: its refusals, its robustness, and its answer times.
 
-use canopen::program::{FlashError, ProgramControl};
+use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{abort_code, press, Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
@@ -8,13 +8,11 @@ use coflash_core::device::Doing;
 use coflash_core::update::event::Phase;
 use coflash_core::update::steps::enter_bootloader;
 use coflash_core::update::{flash, Event, FlashOptions};
-use coflash_core::Error;
 use emulator::machine::Options;
 use emulator::time::Span;
 use kit::rig::block;
 
 const DATA: Address = Address::new(0x1F50, 1);
-const CONTROL: Address = Address::new(0x1F51, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
 const VERSION: u16 = 0x100A;
 
@@ -44,36 +42,6 @@ fn send(bench: &mut Bench, block: &[u8]) -> (Option<u32>, u32) {
 }
 
 #[test]
-fn wrong_blocks_are_refused_with_abort_and_status_and_the_right_one_is_taken() {
-    let mut bench = Bench::new().switched_on();
-    bench.session().command(1, ProgramControl::Clear).unwrap();
-    assert_eq!(bench.session().await_idle(1, Doing::Read(STATUS)).unwrap().to_word(), 0);
-    let blank = program_flash(&mut bench);
-    let mut bad_crc = block(1, program_start(), &[1; 100]);
-    bad_crc[50] ^= 0x10;
-    assert_eq!(
-        send(&mut bench, &block(1, program_start(), &[1; 100])),
-        (Some(0x0800_0022), 0x88),
-        "before block 0"
-    );
-    assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
-    for (what, bad, abort, status) in [
-        ("wrong CRC", bad_crc, 0x0800_0020, 0x06),
-        ("wrong sequence", block(2, program_start(), &[1; 100]), 0x0800_0022, 0x88),
-        ("over the bootloader", block(1, firmware::board().bootloader.base, &[1; 100]), 0x0800_0020, 0x0E),
-        ("outside the flash", block(1, firmware::board().chip.flash.end(), &[1; 100]), 0x0800_0020, 0x0C),
-        ("too large", block(1, program_start(), &[1; 16384 - 15]), 0x0607_0012, 0x04),
-    ] {
-        assert_eq!(send(&mut bench, &bad), (Some(abort), status), "{what}");
-        assert_eq!(program_flash(&mut bench), blank, "{what}");
-    }
-    let good = firmware::made_up(1000, |_| 1);
-    assert_eq!(send(&mut bench, &block(1, program_start(), &good)), (None, 0));
-    bench.run_ms(2000);
-    assert_eq!(program_flash(&mut bench)[..1001], [&good[..], &[0xFF]].concat());
-}
-
-#[test]
 fn the_largest_block_of_the_manual_is_taken() {
     let mut bench = Bench::new().switched_on();
     bench.session().command(1, ProgramControl::Clear).unwrap();
@@ -84,87 +52,6 @@ fn the_largest_block_of_the_manual_is_taken() {
     // Erased and programmed in the background.
     bench.run_ms(2000);
     assert_eq!(program_flash(&mut bench)[..data.len()], data);
-}
-
-#[test]
-fn commands_without_a_program_and_unknown_ones() {
-    let mut bench = Bench::new().switched_on();
-    for command in [ProgramControl::Start, ProgramControl::SetSignature] {
-        bench.session().command(1, command).unwrap();
-        let status = bench.session().await_idle(1, Doing::Command(command)).unwrap();
-        assert_eq!(status.error, Some(FlashError::NoValidProgram), "{command:?}");
-    }
-    bench.session().command(1, ProgramControl::ResetStat).unwrap();
-    assert_eq!(bench.session().read_number(STATUS).unwrap(), 0);
-    let refused = bench.session().write(CONTROL, &[0x42], Doing::Read(CONTROL), &mut |_| {});
-    assert!(matches!(refused, Err(Error::Refused { code, .. }) if code.0 == 0x0609_0030), "{refused:?}");
-    assert_eq!(bench.events(), [], "no reset");
-}
-
-#[test]
-fn a_transfer_that_breaks_off_does_not_block_the_next_one() {
-    let mut bench = Bench::new().switched_on();
-    bench.session().command(1, ProgramControl::Clear).unwrap();
-    bench.session().await_idle(1, Doing::Read(STATUS)).unwrap();
-    // Initiate a segmented download of 24 bytes (21h, size indicated), send one segment, then
-    // nothing.
-    bench.assert_answer(
-        REQUEST,
-        &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0],
-        RESPONSE,
-        &[0x60, 0x50, 0x1F, 0x01, 0, 0, 0, 0],
-    );
-    bench.assert_answer(REQUEST, &[0x00, 0, 0, 0, 0, 0, 0, 0], RESPONSE, &[0x20, 0, 0, 0, 0, 0, 0, 0]);
-    // Another client begins at once, and gets answers.
-    assert_eq!(send(&mut bench, &block(0, 0, &[0; 8])), (None, 0));
-    // Again, and this time the server's time-out ends the transfer: abort 05040000h for 1F50h/1.
-    bench.ask(REQUEST, &[0x21, 0x50, 0x1F, 0x01, 24, 0, 0, 0], RESPONSE);
-    let from = bench.time();
-    bench.run_ms(5000);
-    let said = bench.frames_of(RESPONSE, from);
-    assert_eq!(said.len(), 1, "{said:?}");
-    assert_eq!(said[0].1, [0x80, 0x50, 0x1F, 0x01, 0x00, 0x00, 0x04, 0x05]);
-    assert_eq!(send(&mut bench, &block(1, program_start(), &firmware::made_up(1000, |_| 7))), (None, 0));
-}
-
-/// The power is cut at eleven points of an update: before anything is lost, during the erase,
-/// between blocks, in the middle of one.
-#[test]
-fn a_power_cut_during_an_update_leaves_a_device_that_takes_the_program() {
-    let mut untouched = 0;
-    for after_ms in [5, 10, 30, 60, 200, 400, 600, 800, 1200, 1800, 2100] {
-        let mut bench = running_board();
-        bench.call_back();
-        let file = firmware::blocks(firmware::APP_V2);
-        // The host cuts the power by its own clock: the update is abandoned at that time, then the
-        // power is cut.
-        let deadline = bench.time() + Span::from_millis(after_ms);
-        let clock = bench.clock();
-        let flag = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
-        let mut session = bench.session();
-        session.cancel_by(std::sync::Arc::clone(&flag));
-        // Without the initial listening, so that the times are those of the update itself.
-        let options = FlashOptions::default().alone(false);
-        let outcome = flash(&mut session, &file, &options, &mut |_| {
-            if clock.get() >= deadline {
-                flag.store(true, std::sync::atomic::Ordering::Relaxed);
-            }
-        });
-        assert!(matches!(outcome, Err(Error::Cancelled)), "cut at {after_ms} ms: {outcome:?}");
-        bench.power_cycle();
-        bench.await_program(1000);
-        if !bench.is_bootloader(NODE) {
-            assert_eq!(bench.text(VERSION), "1.0.0", "cut at {after_ms} ms");
-            untouched += 1;
-        }
-        bench.update(firmware::APP_V2);
-        assert_eq!(bench.text(VERSION), "2.0.0", "cut at {after_ms} ms");
-        bench.assert_nothing_unmodelled();
-    }
-    assert!(
-        (1..=5).contains(&untouched),
-        "the old program outlives what comes before the first block: {untouched}"
-    );
 }
 
 #[test]

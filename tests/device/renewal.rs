@@ -3,7 +3,7 @@
 
 use canopen::program::{
     FlashError, FlashStatus, ProgramControl, ProgramStart, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID,
-    PROGRAM_VERSION, STATE_BOOTLOADER, STATE_PROGRAM_START, STATE_RENEWAL,
+    PROGRAM_VERSION, STATE_BOOTLOADER, STATE_PROGRAM_START,
 };
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
@@ -15,9 +15,8 @@ use coboot_tests::renewal::{
 use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Operation, Options, Stop};
-use emulator::silicon::{Silicon, WORST};
+use emulator::silicon::WORST;
 use emulator::time::Span;
-use kit::random::Random;
 use shared_abi::geometry::Region;
 use shared_abi::handoff::ResetCause;
 use shared_abi::ram_image::Header;
@@ -48,13 +47,9 @@ const FAULTS: [u16; 1] = [0xDE00];
 /// Writes SYSRESETREQ to AIRCR (B3.2.6): two loads of the literals at the end, a store.
 const RESETS: [u16; 8] = [0x4801, 0x4902, 0x6001, 0xE7FE, 0xED0C, 0xE000, 0x0004, 0x05FA];
 
-fn board() -> Bench {
-    board_on(Options::default())
-}
-
 /// A board with a program that has shown that it comes back, in the bootloader.
-fn board_on(options: Options) -> Bench {
-    let mut bench = Bench::with(options).switched_on();
+fn board() -> Bench {
+    let mut bench = Bench::new().switched_on();
     bench.install(firmware::APP_V1);
     bench.confirm_program();
     call_back(&mut bench);
@@ -335,63 +330,6 @@ fn a_trial_that_nobody_confirms_ends() {
     assert_eq!(running(&mut bench), 1);
     start(&mut bench);
     confirm(&mut bench);
-}
-
-/// Cuts of the power anywhere in a renewal, drawn by seeds, and a second one in what follows.
-#[test]
-fn a_cut_anywhere_leaves_a_bootloader_and_the_program() {
-    let new = version(firmware::BOOTLOADER, NEW);
-    // Operations of the flash: staging is erased, written, recorded; home the same.
-    let operations = 2 * new.len() / 4 + 40;
-    for seed in 0..6 {
-        let mut random = Random(seed);
-        let mut bench = board_on(Options { silicon: Silicon::drawn(seed), seed, ..Options::default() });
-        for _ in 0..2 {
-            let operation = random.below(operations) as u64;
-            let torn = random.next();
-            let when = random.pick(&[
-                Cut::Before,
-                Cut::After,
-                Cut::Torn { seed: torn },
-                Cut::Unstable { seed: torn },
-            ]);
-            println!("seed {seed}: operation {operation}, {when:?}");
-            bench.machine().cut_power_at(Some(FlashCut { operation, when }));
-            let _ = renew(&mut bench, &new);
-            bench.machine().cut_power_at(None);
-            power_cycle(&mut bench);
-            bench.events();
-            assert!(!bench.is_bootloader(NODE), "the program starts");
-            call_back(&mut bench);
-        }
-        renew(&mut bench, &new).unwrap();
-        assert_eq!(cells(&bench, home(new.len())), new);
-        assert_eq!(progress(&mut bench).state, State::Installed);
-    }
-}
-
-/// What a tool does, from whatever state.
-fn renew(bench: &mut Bench, new: &[u8]) -> Result<(), coflash_core::Error> {
-    let doing = Doing::Write(Address::new(PROGRAM_DATA, number()));
-    let n = number();
-    let mut session = bench.session();
-    session.await_idle(n, doing)?;
-    let word = session.read_number(Address::new(DEVICE_STATE, STATE_RENEWAL))?;
-    let at = Address::new(PROGRAM_ID, n);
-    if word as u8 == State::Installed as u8 && session.read_number(at)? == crc_of(new) {
-        return Ok(());
-    }
-    session.command(n, ProgramControl::Clear)?;
-    let at = Address::new(PROGRAM_DATA, n);
-    session.write(at, new, doing, &mut |_| {})?;
-    session.await_idle(n, doing)?;
-    session.command(n, ProgramControl::Start)?;
-    drop(session);
-    bench.run_ms(100);
-    let mut session = bench.session();
-    session.command(n, ProgramControl::SetSignature)?;
-    session.await_idle(n, doing)?;
-    Ok(())
 }
 
 /// What cannot run here is refused, and the old image stays.
