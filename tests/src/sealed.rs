@@ -17,7 +17,7 @@ use shared_abi::geometry::Region;
 use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::BootRequest;
 
-use attack::model::choice;
+use attack::model::{choice, FIRST};
 use kit::boot::Boot;
 use kit::model::{Chip, ModelFlash, CHIP};
 use kit::rig::{go_on, Node, BOARD_NODE};
@@ -109,7 +109,8 @@ impl Device {
 
     /// The program that the boot stage starts.
     pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
-        match choice(&self.chip, &self.parameters(), self.setup.layout, ResetCause::PowerOn, request).exit {
+        let reset = (ResetCause::PowerOn, request);
+        match choice(&self.chip, &self.parameters(), self.setup.layout, FIRST, reset).exit {
             Exit::Program(Start { number, .. }) => Some(number),
             Exit::Bootloader { .. } | Exit::Again | Exit::Choose => None,
         }

@@ -154,6 +154,11 @@ pub struct Observation {
     /// The program that starts after a power-on, and whether it is whole and released. (Program 1
     /// alone starts by itself.)
     pub starting: Option<(u8, bool)>,
+    /// Why it would stay in the bootloader after a power-on, as it says (2007h/2) and as the boot
+    /// stage chooses, if any program may start by itself; 255 if one starts.
+    pub stays: [u32; 2],
+    /// The released programs, number 1 in bit 0: as it says (2007h/12), and by their records.
+    pub released: [u32; 2],
     /// The stored node-ID and bit rate.
     pub node: NodeParameters,
     /// Whether the last values of LSS are stored, as the device says.

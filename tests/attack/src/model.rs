@@ -8,7 +8,7 @@ use boot_core::flash::{run, Flash};
 use boot_core::renewal::check;
 use boot_core::store::{Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord};
 use canopen::od::Address;
-use canopen::program::PROGRAM_PARTIAL;
+use canopen::program::{PROGRAM_PARTIAL, STATE_REASON, STATE_RELEASED, STATE_STARTS};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
 use kit::model::{caught, ModelFlash, PowerCut};
 use kit::renewal::{load, loads, HOME, PLACES, STAGING};
@@ -24,6 +24,8 @@ use crate::files::{file, OLD};
 use crate::mistakes::{Mistake, Store};
 use crate::sealed::{default_keys, keys, request};
 
+/// Program 1 alone starts by itself.
+pub const FIRST: Autostart = Autostart::List(&[1]);
 /// More steps than any work takes.
 const ENDLESS: usize = 1_000_000;
 
@@ -52,17 +54,15 @@ fn renews(setup: &Setup) -> bool {
     setup.profile.extras.bootloader.is_some()
 }
 
-/// The boot stage's choice on a device whose bootloader is whole. Program 1 starts by itself, at
-/// once.
+/// The boot stage's choice on a device whose bootloader is whole. A program starts at once.
 pub fn choice(
     flash: &impl Flash,
     parameters: &impl Parameters,
     layout: &'static Layout,
-    cause: ResetCause,
-    request: Option<BootRequest>,
+    autostart: Autostart,
+    (cause, request): (ResetCause, Option<BootRequest>),
 ) -> Choice<()> {
-    let policy =
-        decision::Policy { autostart: Autostart::List(&[1]), ..decision::Policy::plain(layout, &[1, 2]) };
+    let policy = decision::Policy { autostart, ..decision::Policy::plain(layout, &[1, 2]) };
     let node = NodeParameters::load(parameters, flash, BOARD_NODE, |_| true);
     let woken = Woken { cause, request, ..Woken::power_on(node.id_or_none(), node.bit_rate) };
     choose(&woken, &Images::SOUND, flash, parameters, &policy)
@@ -161,8 +161,8 @@ impl Model {
         let layout = self.setup.layout;
         let mut flash = self.rig.chip.clone();
         let mut store = Store::open(&flash, layout, self.mistake);
-        if let Some(decision::Store::CrashCount(count)) = choice(&flash, &store, layout, cause, request).store
-        {
+        let choice = choice(&flash, &store, layout, FIRST, (cause, request));
+        if let Some(decision::Store::CrashCount(count)) = choice.store {
             store.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
             let _ = run(&mut flash, |flash, outcome| store.next(flash, outcome));
         }
@@ -400,8 +400,19 @@ impl Device for Model {
             let partial = self.is_fresh.then(|| partial(rig, number, &flash)).flatten();
             Program { stored, record, state, crc, status, is_true, counter, partial }
         });
-        let programs = programs.collect();
-        let starting = match choice(&flash, &journal, layout, ResetCause::PowerOn, None).exit {
+        let programs: Vec<Program> = programs.collect();
+        let chosen =
+            |autostart| choice(&flash, &journal, layout, autostart, (ResetCause::PowerOn, None)).exit;
+        let stays = match chosen(Autostart::InOrder) {
+            Exit::Bootloader { stay, .. } if stay.held == 0 => stay.reason as u32,
+            _ => STATE_STARTS.into(),
+        };
+        let released = (1..).zip(&programs).map(|(number, program)| {
+            let is_signed = program.record.is_some_and(|record| record.signed);
+            u32::from(is_signed && !setup.is_data(number)) << (number - 1)
+        });
+        let released = released.sum();
+        let starting = match chosen(FIRST) {
             Exit::Program(start) => {
                 let region = setup.region(start.number);
                 let is_whole = |record: ProgramRecord| {
@@ -423,6 +434,8 @@ impl Device for Model {
             is_staged: record.is_some_and(|record| staged.is_ok_and(|image| image.crc == record.crc)),
             programs,
             starting,
+            stays: [self.rig.word(0x2007, STATE_REASON), stays],
+            released: [self.rig.word(0x2007, STATE_RELEASED), released],
             node: NodeParameters::load(&journal, &flash, BOARD_NODE, |_| true),
             is_stored: self.rig.node.stored() == Poll::Ready(Ok(())),
             touched,

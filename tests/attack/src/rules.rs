@@ -252,6 +252,7 @@ pub const RULES: &[Rule] = &[
     Rule { name: "no program follows a proved one with a higher counter", is_kept: follows },
     Rule { name: "with confirmation a counter waits for it", is_kept: waits },
     Rule { name: "a sealed bootloader follows one with a lower counter", is_kept: follows_home },
+    Rule { name: "2007h/2 is what a power-on does, and 2007h/12 is what is released", is_kept: says_what_is },
 ];
 
 /// The first rule that is broken.
@@ -446,6 +447,13 @@ fn follows_home(before: &History, now: &Observation) -> bool {
     let counter = |crc| counter_of_image(setup, crc);
     let follows = |(staged, home)| counter(staged) > counter(home);
     !setup.takes_sealed || !is_certain || staged.zip(was.home).is_none_or(follows)
+}
+
+fn says_what_is(before: &History, now: &Observation) -> bool {
+    let same = |[said, is]: [u32; 2]| said == is;
+    // The boot stage of this device takes data for a program.
+    let has_data = before.setup.profile.download.data.is_some();
+    !now.is_idle || !now.is_certain || (has_data || same(now.stays)) && same(now.released)
 }
 
 fn waits(before: &History, now: &Observation) -> bool {

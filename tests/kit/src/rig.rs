@@ -11,6 +11,7 @@ use boot_core::bootloader::{
     entries, entry_count, Bootloader, Choices, Config, Everything, Extras, PasswordObject,
 };
 use boot_core::control::{Erase, Policy, Renewal, Sealed, SealedMemory, Step};
+use boot_core::decision::crash_count;
 use boot_core::flash::{run, Flash};
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
@@ -443,6 +444,7 @@ impl Rig {
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let mut boot = Boot::new(&setup.config, node);
+        boot.report.crash_resets = crash_count(&parameters, &flash) as u8;
         let number = setup.profile.extras.bootloader;
         if number.is_some() {
             let loaded = loads(&flash, setup.layout, setup.host(), request);
