@@ -29,12 +29,13 @@ fn built() -> Option<Vec<u8>> {
     build(&example(), "no-stack", &alone)
 }
 
-/// The ELF file of a copy of the example in which `old` is replaced by `new`: a change by its
-/// author.
+/// The ELF file of a copy of the example in which `old` is replaced by `new` in the program or in its
+/// build script: a change by its author.
 fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
     let alone = alone();
     let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);
     fs::create_dir_all(copy.join("src")).expect("the folder can be made");
+    let mut found = 0;
     for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/identity.rs", "src/main.rs"] {
         let text = fs::read_to_string(example().join(file)).expect(file);
         let text = match file {
@@ -42,14 +43,15 @@ fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
             "Cargo.toml" | "Cargo.lock" => text
                 .replace("\"no-stack\"", &format!("{name:?}"))
                 .replace("../../", &format!("{}/../", env!("CARGO_MANIFEST_DIR"))),
-            "src/main.rs" => {
-                assert_eq!(text.matches(old).count(), 1, "{old:?} is to be altered");
+            "src/main.rs" | "build.rs" => {
+                found += text.matches(old).count();
                 text.replace(old, new)
             }
             _ => text,
         };
         fs::write(copy.join(file), text).expect("the copy can be written");
     }
+    assert_eq!(found, 1, "{old:?} is to be altered");
     build(&copy, name, &alone)
 }
 
@@ -85,6 +87,15 @@ fn blocks(elf: &[u8]) -> Program {
 fn power_cycle(bench: &mut Bench) {
     bench.power_cycle();
     bench.run_ms(500);
+}
+
+/// `.keeping_ram()` ends the RAM a KiB before its end, where the stack begins.
+#[test]
+fn its_build_script_may_keep_the_end_of_the_ram() {
+    let Some(plain) = built() else { return };
+    let keeping = altered("keeping-ram", ".emit()", ".keeping_ram().emit()").unwrap();
+    let stack = |elf: &[u8]| u32::from_le_bytes(blocks(elf).flash_image()[..4].try_into().unwrap());
+    assert_eq!((stack(&plain), stack(&keeping)), (0x2001_FFC0, 0x2001_FBC0));
 }
 
 /// Step 1: the memory map in the repository equals the printed one.
