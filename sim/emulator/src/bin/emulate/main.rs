@@ -170,24 +170,18 @@ fn board(name: &str) -> Result<Board, String> {
 }
 
 impl Board {
-    /// The circuit around the chip: of the board's file, or of the one that a build has put beside this bootloader. A
-    /// board without either has 8 MHz, its transceiver at CAN1, its serial port at USART2 and no resistors at its pins,
-    /// unless it is listed here.
+    /// The circuit around the chip: of the board's file, or of the one that a build has put beside
+    /// this bootloader. A board without either has 8 MHz, its transceiver at CAN1, its serial port at
+    /// USART2 and no resistors at its pins.
     fn circuit(&self, bootloader: Option<&Path>) -> Circuit {
         let name = self.layout.board;
         let beside = || {
-            let file = bootloader?.parent()?.join(name).with_extension("toml");
+            let file = bootloader?.parent()?.join(format!("{name}.toml"));
             let (layout, circuit) = coboot_linker::board::described(file.to_str()?).ok()?;
             circuit.filter(|_| layout.board == name)
         };
         let plain = Circuit { crystal: 8_000_000, can: 1, usart: "USART2", pulled_up: None };
-        self.circuit.or_else(beside).unwrap_or(match name {
-            "stm32f407g-disc1-can2" => Circuit { can: 2, ..plain },
-            // B1 (UM1724).
-            "nucleo-f446re" => Circuit { pulled_up: Some(('C', 13)), ..plain },
-            "stm32f429i-disc1" => Circuit { usart: "USART1", ..plain },
-            _ => plain,
-        })
+        self.circuit.or_else(beside).unwrap_or(plain)
     }
 }
 
@@ -797,19 +791,23 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("coboot-emulate-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let own = Circuit { crystal: 25_000_000, can: 2, usart: "USART1", pulled_up: Some(('A', 0)) };
-        let file = folder.join("nucleo-f446re.toml");
         let map = include_str!("../../../tests/it/my-board.toml");
-        let named = map.replace("my-board", "nucleo-f446re");
-        std::fs::write(&file, format!("{named}{own}")).unwrap();
         let bootloader = folder.join("bootloader.elf");
         let circuit = |word: &str, beside| board(word).unwrap().circuit(beside);
-        assert_eq!(circuit(file.to_str().unwrap(), None), own);
-        assert_eq!(circuit("nucleo-f446re", Some(&bootloader)), own);
-        let known = Circuit { crystal: 8_000_000, can: 1, usart: "USART2", pulled_up: Some(('C', 13)) };
-        assert_eq!(circuit("nucleo-f446re", None), known);
-        // The file is that of another board.
-        std::fs::write(&file, format!("{map}{own}")).unwrap();
-        assert_eq!(circuit("nucleo-f446re", Some(&bootloader)), known);
+        let plain = Circuit { crystal: 8_000_000, can: 1, usart: "USART2", pulled_up: None };
+        // A name may have a dot; then it is that of a file, which needs no circuit of its own.
+        let other = folder.join("other.toml");
+        std::fs::write(&other, map.replace("my-board", "my.board")).unwrap();
+        for (name, word) in [("nucleo-f446re", "nucleo-f446re"), ("my.board", other.to_str().unwrap())] {
+            let file = folder.join(format!("{name}.toml"));
+            std::fs::write(&file, format!("{}{own}", map.replace("my-board", name))).unwrap();
+            assert_eq!(circuit(file.to_str().unwrap(), None), own);
+            assert_eq!(circuit(word, Some(&bootloader)), own);
+            assert_eq!(circuit(word, None), plain);
+            // The file is that of another board.
+            std::fs::write(&file, format!("{map}{own}")).unwrap();
+            assert_eq!(circuit(word, Some(&bootloader)), plain);
+        }
         std::fs::remove_dir_all(folder).unwrap();
     }
 }
