@@ -32,11 +32,8 @@ pub const KEY_BLOCK_SIZE: u32 = 256;
 /// boot stage, which copies the RAM image, uses the same RAM.
 pub const LEAST_STACK: u32 = 4096;
 
-/// The size of [`Layout::kept`] in bytes, on a chip that has it to spare.
+/// The size of [`Layout::kept`] in bytes.
 const KEPT: u32 = 1024;
-/// The least SRAM of such a chip: beside the largest RAM image and its stack it has room for the
-/// default queue.
-const KEEPS_FROM: u32 = 128 * 1024;
 
 /// The offset of a word in the bootloader's vector table that is not a vector (PM0214 section
 /// 2.3.4: reserved). It contains [`KNOWS_SEALED_IMAGES`] in a bootloader that uses a key block.
@@ -274,7 +271,8 @@ impl Layout {
     /// reset but that of the power what it wrote before. Empty on a chip with less than 128 KiB.
     #[must_use]
     pub const fn kept(&self) -> Region {
-        let size = if self.chip.sram.size >= KEEPS_FROM && self.ram.size > KEPT { KEPT } else { 0 };
+        // Beside the largest RAM image and its stack, 128 KiB have room for the default queue.
+        let size = if self.chip.sram.size >= 128 * 1024 && self.ram.size > KEPT { KEPT } else { 0 };
         Region::new(self.ram.end() - size, size)
     }
 

@@ -163,7 +163,7 @@ fn a_board_is_made_as_the_guide_says() {
 }
 
 /// Three boards with other crystals and CAN controllers than the first: each is built, offered by the emulator to other
-/// programs and updated, without an option for what `new-board` was told.
+/// programs and updated, without an option that `new-board` had.
 #[test]
 fn boards_with_other_crystals_are_emulated_by_their_names() {
     let copy = Copy::new();
@@ -601,6 +601,6 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
         let flat = |text: &str| {
             text.replace("stm32f4xx_hal::gpio::", "").split_whitespace().collect::<Vec<_>>().join(" ")
         };
-        assert!(flat(&said).contains(&flat(says)), "{says}, not told by:\n{said}");
+        assert!(flat(&said).contains(&flat(says)), "{says}, not said by:\n{said}");
     }
 }

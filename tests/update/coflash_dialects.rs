@@ -171,10 +171,13 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it goes on");
     bench.run_ms(PENALTY_MS);
 
-    // The lines of the page, but for node-ID and password.
+    update_by_the_lines_of_the_page(bench, layout.board, &set);
+}
+
+/// The lines of the page, but for node-ID and password, with this set of parameters in the device.
+fn update_by_the_lines_of_the_page(bench: Bench, board: &str, set: &[u8]) {
     let folder = kit::folder!("lift-of-the-page");
-    std::fs::write(folder.join("app.elf"), firmware::elf(&firmware::of_board(layout.board, APP_LIFT)))
-        .unwrap();
+    std::fs::write(folder.join("app.elf"), firmware::elf(&firmware::of_board(board, APP_LIFT))).unwrap();
     let mut endpoint = Endpoint::new(bench);
     let page =
         include_str!("../../docs/coflash.md").lines().filter_map(|line| line.strip_prefix("$ coflash "));
