@@ -653,14 +653,6 @@ mod tests {
     }
 
     #[test]
-    fn a_call_back_is_answered_and_the_device_leaves_behind_the_pause() {
-        let mut control = control(false);
-        assert_eq!(control.write(1, &[0x80], true, 0, &mut { STORES }), Ok(Reply::Send));
-        assert_eq!(control.proceed(true, 1), Next::Serve);
-        assert_eq!(control.proceed(true, 12), Next::Leave(BootRequest::Stay));
-    }
-
-    #[test]
     fn stop_and_clear_are_left_to_the_bootloader() {
         for (value, sub) in [(0, 1), (3, 2)] {
             let mut control = control(false);
