@@ -19,8 +19,7 @@
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
 //!
-//! The attack below the bus is `tests/attack`, with faults of the flash and sealed images; `masters.rs` in
-//! `core/boot-core/tests` attacks the slave.
+//! The attack below the bus is `tests/attack`, with faults of the flash and sealed images.
 
 pub mod board;
 pub mod line;

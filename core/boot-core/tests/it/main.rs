@@ -9,7 +9,6 @@ mod decision;
 mod download;
 mod faults;
 mod label;
-mod masters;
 mod objects;
 mod parameters;
 mod protection;
