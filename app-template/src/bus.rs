@@ -8,7 +8,7 @@ use rtic::Mutex;
 use crate::entries::PDOS;
 use crate::process::OWN;
 
-/// Those that the slave accepts, SYNC, those of the RPDOs (each PDO has room) and of the application.
+/// Those of the slave, of SYNC, of the RPDOs (each PDO has room) and of the application.
 const IDENTIFIERS: usize = 4 + 1 + PDOS.len() + OWN.len();
 
 /// Carries out the slave's actions until there are none left.

@@ -16,8 +16,8 @@ choices! {
         /// The programs, the preferred one first: the device starts the first one that is valid,
         /// released and allowed. `InOrder` is each program, the lowest number first; a list,
         /// `Autostart::List(&[2, 1])`; or `Autostart::Function`, which returns such a list, from a
-        /// switch for instance, under the conditions of `hooks.start_allowed`. Programs count from 1,
-        /// as sub-indices do: index 0 of the manual (`BLCOP_APP_START_INDEX`) is program 1.
+        /// switch for instance, under the conditions of `hooks.start_allowed`. Programs count from
+        /// 1, as sub-indices do: index 0 of the manual (`BLCOP_APP_START_INDEX`) is program 1.
         programs: Autostart = Autostart::InOrder => [Autostart::Function(|| &[1])];
         /// The number of crashes in a row after which the device stays in the bootloader, 1 to 255.
         max_crash_resets: u32 = 3 => [1];

@@ -196,8 +196,8 @@ mod tests {
     const SLOW: ClockTree = ClockTree { pll_n: 100, apb1: 2, apb2: 1, wait_states: 3, ..FAST };
 
     /// The general operating conditions of the datasheets, in MHz: core, APB1, APB2 (over-drive
-    /// off, regulator at scale 1); and the wait states at the fastest clock (2.7 to 3.6 V). Of a line
-    /// of each kind: `tests/it/lines.rs` has the others.
+    /// off, regulator at scale 1); and the wait states at the fastest clock (2.7 to 3.6 V). Of a
+    /// line of each kind: `tests/it/lines.rs` has the others.
     #[test]
     fn what_is_too_fast_for_a_line_is_refused() {
         for (line, core, apb1, apb2, wait_states) in

@@ -22,8 +22,8 @@ pub fn succeed(command: &mut Command) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What a program for the chip takes from the header and from the library, as C and as C++, as freestanding
-/// as it gets: the assertions on sizes and offsets hold there, too.
+/// What a program for the chip takes from the header and from the library, as C and as C++, as
+/// freestanding as it gets: the assertions on sizes and offsets hold there, too.
 pub fn compile_for_the_chip(compiler: &str, target: &str) {
     let folder = kit::folder!("header-for-the-chip");
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../abi/for_the_chip.c");

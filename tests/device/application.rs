@@ -29,8 +29,8 @@ fn built() -> Option<Vec<u8>> {
     build(&example(), "no-stack", &alone)
 }
 
-/// The ELF file of a copy of the example in which `old` is replaced by `new` in the program or in its
-/// build script: a change by its author.
+/// The ELF file of a copy of the example in which `old` is replaced by `new` in the program or in
+/// its build script: a change by its author.
 fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
     let alone = alone();
     let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);

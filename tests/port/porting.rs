@@ -162,8 +162,8 @@ fn a_board_is_made_as_the_guide_says() {
     assert!(output.contains("a node of my own"), "the device does not say its name:\n{output}");
 }
 
-/// Three boards with other crystals and CAN controllers than the first: each is built, offered by the emulator to other
-/// programs and updated, without an option that `new-board` had.
+/// Three boards with other crystals and CAN controllers than the first: each is built, offered by
+/// the emulator to other programs and updated, without an option that `new-board` had.
 #[test]
 fn boards_with_other_crystals_are_emulated_by_their_names() {
     let copy = Copy::new();

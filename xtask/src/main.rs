@@ -189,8 +189,8 @@ mod tests {
         }
     }
 
-    /// The standard output is the job's: what it prints may be JSON for a program (`cargo xtask bench
-    /// --json`). What every job does on its way, such as building, goes to the standard error.
+    /// The standard output is the job's: what it prints may be JSON for a program (`cargo xtask
+    /// bench --json`). What every job does on its way, such as building, goes to the standard error.
     #[test]
     fn only_a_job_itself_prints_on_the_standard_output() {
         for name in

@@ -337,9 +337,9 @@ pub struct Policy {
     pub rescue_window_ms: u16,
     /// The rescue window of a confirmed program, in ms.
     pub rescue_window_confirmed_ms: u16,
-    /// Whether a program may start now, released or on trial. It is called in the boot stage, before
-    /// any peripheral is set up, and when 2007h/2 is read, while the flash may be busy: it reads no
-    /// flash, returns at once, and leaves the peripherals as it finds them.
+    /// Whether a program may start now, released or on trial. It is called in the boot stage,
+    /// before any peripheral is set up, and when 2007h/2 is read, while the flash may be busy: it
+    /// reads no flash, returns at once, and leaves the peripherals as it finds them.
     pub start_allowed: fn(program: u8) -> bool,
     /// Two resets by the pin in a row keep the device in the bootloader ([`PinReset`]).
     pub two_resets: bool,

@@ -305,15 +305,15 @@ impl<'b, C: Choices> Programmer<'b, C> {
         self.renewing.as_ref().and_then(|renewing| renewing.record)
     }
 
-    /// **The rule of staging**: whether a download of this program, or a command that erases it, may
-    /// go on now.
+    /// **The rule of staging**: whether a download of this program, or a command that erases it,
+    /// may go on now.
     ///
     /// - Nothing removes the record of a *confirmed* image but its installation. Until then neither
     ///   the last program nor another image takes its flash.
     /// - Data are not changed while a record for them is valid: an image waits until a program that
     ///   reaches into staging was cleared.
     ///
-    /// The answer may change while a download is open, by another download or by an installation that
+    /// The answer may change while a download is open, by another one or by an installation that
     /// failed. So `control` asks at the beginning of each transfer and each command, and once more
     /// before anything is lost for the first data; [`may_replace`](Self::may_replace) asks last.
     ///

@@ -173,8 +173,8 @@ fn date_and_time_are_those_of_block_0_or_of_the_label() {
     assert_eq!(date(&mut bench), [0, 0], "erased");
 }
 
-/// Cuts the power at each operation of an update of this flash, in each way. `look` gets what is left,
-/// and the cut in words.
+/// Cuts the power at each operation of an update of this flash, in each way. `look` gets what is
+/// left, and the cut in words.
 fn cut_at_each_operation(
     mut installed: ModelFlash,
     update: impl Fn(&mut ModelFlash),

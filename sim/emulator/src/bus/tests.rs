@@ -693,8 +693,8 @@ fn a_line_that_stays_dominant_lets_nobody_in_and_nobody_out() {
 
 /// ISO 11898-1:2015, 12.1.4, rule c, exception 1: without an acknowledge the counter of a transmitter
 /// ends at 128. A controller repeats the frame for ever (RM0090 section 32.7.1): 48 bits less ACK
-/// delimiter and end of frame (8), 6 of error flag, 8 of delimiter, and 3, which are 57. Error passive
-/// after the 16th: 8 bits more.
+/// delimiter and end of frame (8), 6 of error flag, 8 of delimiter, and 3, which are 57. Error
+/// passive after the 16th: 8 bits more.
 #[test]
 fn a_controller_that_nobody_acknowledges_ends_error_passive_and_repeats() {
     let mut bench = Bench::new(vec![controller(0, 0)]);

@@ -171,8 +171,8 @@ fn board(name: &str) -> Result<Board, String> {
 
 impl Board {
     /// The circuit around the chip: of the board's file, or of the one that a build has put beside
-    /// this bootloader. A board without either has 8 MHz, its transceiver at CAN1, its serial port at
-    /// USART2 and no resistors at its pins.
+    /// this bootloader. A board without either has 8 MHz, its transceiver at CAN1, its serial port
+    /// at USART2 and no resistors at its pins.
     fn circuit(&self, bootloader: Option<&Path>) -> Circuit {
         let name = self.layout.board;
         let beside = || {
