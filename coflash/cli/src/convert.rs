@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use clap::Args;
+use coflash_core::file::area::Area;
 use coflash_core::file::block_file::{self, BlockFile, FRAMING};
 use coflash_core::file::convert::{Converted, Label};
-use coflash_core::file::judge::{judge, StackAtEnd};
+use coflash_core::file::judge::{judge, Fault, StackAtEnd};
 use coflash_core::file::read::Firmware;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
 use coflash_core::file::{Program, Target};
@@ -180,10 +181,18 @@ impl Convert {
         warn(context, input, &done.notes, done.left_out);
         let program = &done.program;
         let (image, start) = (program.image(), program.start());
-        match (self.source.layout()?, StackAtEnd::of(image, start)) {
-            (None, Some(stack)) => context.out.warn(format_args!("{}: {stack}", input.display())),
-            (None, None) => {}
-            (board, _) => judge(image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
+        let (board, file) = (self.source.layout()?, input.display());
+        let judged = match start {
+            // For the judge this is an image without addresses.
+            0 => Err(Fault::Elsewhere { range: program.span(), area: Area::Alias }),
+            _ => judge(image, start, board),
+        };
+        match (board, judged, StackAtEnd::of(image, start)) {
+            (Some(_), Err(fault), _) => return Err(Failure::no_program(input, fault)),
+            // The manual's tool converts any data, and so does this one for a board that it does not know.
+            (None, Err(fault), _) => context.out.warn(format_args!("{file}: {fault}: {}", fault.advice())),
+            (None, Ok(()), Some(stack)) => context.out.warn(format_args!("{file}: {stack}")),
+            (_, Ok(()), _) => {}
         }
         if sealing.is_none() {
             output_file::write(&output, &block_file::emit(program))?;

@@ -146,7 +146,7 @@ impl Source {
     ) -> Result<Converted, Failure> {
         let options = self.options(self.place.options(program)?, label);
         let mut done = program_of(firmware, &options).map_err(|error| Failure::convert(error, file))?;
-        done.notes.extend(Note::of_staging(done.program.span().last, self.layout()?));
+        done.notes.extend(Note::of_staging(done.program.span(), self.layout()?));
         Ok(done)
     }
 

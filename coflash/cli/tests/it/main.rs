@@ -180,7 +180,6 @@ fn each_fault_of_a_file_says_what_to_do() {
         ("another machine", with(18, 243), "Arm"),
         ("an object file", with(16, 1), "the linker's output"),
         ("an archive", b"PK\x03\x04".to_vec(), "unpack it"),
-        ("an image for MCUboot", b"\x3D\xB8\xF3\x96\0\0\0\0".to_vec(), "zephyr.elf"),
         (
             "other data twice",
             hex.replace(end, ":02000004080 1F1\n:0100000055AA\n:00000001FF").replace(' ', "").into_bytes(),
@@ -198,6 +197,9 @@ fn each_fault_of_a_file_says_what_to_do() {
         coflash(&["convert", &data("program.s2"), &folder.path("out.blk"), "--board", "nucleo-f446re"]);
     assert_eq!(done.exit, 3, "{}", done.err);
     assert!(done.err.contains("S3 records") && done.err.contains("--adjust-start"), "{}", done.err);
+    let low = fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", "", 1);
+    let done = coflash(&["convert", &folder.file("low.hex", low.as_bytes()), &folder.path("out.blk")]).good();
+    assert!(done.err.contains("S3 records") && done.err.contains("warning"), "{}", done.err);
 }
 
 #[test]
@@ -237,10 +239,17 @@ fn inspect_tells_what_a_file_holds() {
     full[..8].copy_from_slice(&[0xC0, 0xFF, 1, 0x20, 1, 2, 2, 8]);
     let (full, out) = (folder.file("full.bin", &full), folder.path("full.blk"));
     for words in [&["inspect", &full][..], &["convert", &full, &out]] {
-        let done = coflash(&[words, &["--board", "stm32f407g-disc1"]].concat()).good();
-        let said = done.out + &done.err;
-        assert!(said.contains("the program reaches into staging, from 080E0000h on"), "{said}");
+        for place in [["--board", "stm32f407g-disc1"], ["--start-address", "0x08020000"]] {
+            let done = coflash(&[words, &place].concat()).good();
+            let said = done.out + &done.err;
+            assert!(said.contains("the program reaches into staging, from 080E0000h on"), "{said}");
+        }
     }
+    // The manual's tool converts any data; without a board it is done with a warning.
+    let signed = folder.file("signed.bin", &[&b"\x3D\xB8\xF3\x96"[..], &[0; 60]].concat());
+    let done = coflash(&["convert", &signed, &out, "--start-address", "0x08020000"]).good();
+    assert!(done.err.contains("warning") && done.err.contains("an image for MCUboot"), "{}", done.err);
+    coflash(&["convert", &signed, &out]).fails(3, &["but an image for MCUboot", "zephyr.elf"]);
 }
 
 /// A bus with a valid URL that does not exist.

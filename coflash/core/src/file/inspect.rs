@@ -108,7 +108,7 @@ impl Inspection {
             bootloader: RamImage::find(image).map(|found| (*found.header(), found.check())),
             judgement: judge(image, start, board),
             stack_at_end: StackAtEnd::of(image, start).filter(|_| board.is_none()),
-            notes: image.notes().iter().copied().chain(Note::of_staging(image.span().last, board)).collect(),
+            notes: image.notes().iter().copied().chain(Note::of_staging(image.span(), board)).collect(),
             blocks: None,
         }
     }

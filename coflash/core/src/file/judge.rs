@@ -138,9 +138,10 @@ pub fn judge(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fa
 /// The fault of an image that does not begin with vectors, if its contents name one.
 pub(super) fn named_image(image: &Image, start: u32) -> Option<Fault> {
     /// The room that Zephyr and imgtool leave for the header of MCUboot.
-    const HEADERS: [u32; 3] = [0x100, 0x200, 0x400];
-    let first = image.bytes::<8>(start).unwrap_or_default();
-    if let Some(foreign) = foreign::of_image(&first) {
+    const HEADERS: [u32; 4] = [0x100, 0x200, 0x400, 0x800];
+    let first = image.part(AddressRange { first: start, last: start.saturating_add(511) });
+    let first = first.iter().flat_map(Image::segments).find(|(at, _)| *at == start);
+    if let Some(foreign) = first.and_then(|(_, bytes)| foreign::of_image(&bytes)) {
         return Some(Fault::Foreign(foreign));
     }
     let is_program = |at: &u32| is_begin(image, *at, &Memory::ANY);
@@ -151,11 +152,13 @@ pub(super) fn named_image(image: &Image, start: u32) -> Option<Fault> {
 }
 
 /// Where a program begins in an image with other data before it: the first sector after `first`
-/// that begins with a vector table.
+/// that begins with a vector table, or with the header of MCUboot.
 pub(super) fn program_after(image: &Image, first: u32) -> Option<u32> {
     let step = FIRST_SECTOR.len() as u32;
     let sectors = (first / step + 1..=image.span().last / step).map(|number| number * step);
-    sectors.filter(|at| FLASH.has(*at)).find(|at| is_begin(image, *at, &Memory::ANY))
+    let is_program =
+        |at: &u32| is_begin(image, *at, &Memory::ANY) || image.bytes(*at) == Some(foreign::MCUBOOT);
+    sectors.filter(|at| FLASH.has(*at)).find(is_program)
 }
 
 fn judge_image(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fault> {
@@ -178,7 +181,7 @@ fn judge_image(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), 
         None => return Err(Fault::NoVectors),
     };
     if start == 0 && FIRST_SECTOR.has(vector & !1) {
-        judge_stack(stack, board)?;
+        memory.judge_stack(stack).map_err(|fault| named(fault, [stack, 0], FLASH, board))?;
         return Err(Fault::Bootloader);
     }
     if start != 0 {
@@ -274,11 +277,6 @@ fn is_begin(image: &Image, address: u32, memory: &Memory) -> bool {
     })
 }
 
-fn judge_stack(stack: u32, board: Option<&Layout>) -> Result<(), Fault> {
-    let memory = memory_of(board);
-    memory.judge_stack(stack).map_err(|fault| named(fault, [stack, 0], FLASH, board))
-}
-
 fn judge_words(words: [u32; 2], range: AddressRange, board: Option<&Layout>) -> Result<(), Fault> {
     let memory = memory_of(board);
     // The range lies in the flash, so its size has 32 bits.
@@ -305,9 +303,7 @@ fn named(fault: VectorFault, words: [u32; 2], range: AddressRange, board: Option
 
 /// Initial stack pointer and reset vector.
 fn vectors(image: &Image, start: u32) -> Option<[u32; 2]> {
-    let bytes: [u8; 8] = image.bytes(start)?;
-    let [a, b, c, d, e, f, g, h] = bytes;
-    Some([[a, b, c, d], [e, f, g, h]].map(u32::from_le_bytes))
+    Some([image.bytes(start)?, image.bytes(start.checked_add(4)?)?].map(u32::from_le_bytes))
 }
 
 #[cfg(test)]
@@ -322,10 +318,7 @@ mod tests {
     const START: u32 = 0x0801_0000;
 
     fn with(stack_pointer: u32, vector: u32, at: u32) -> Result<(), Fault> {
-        let mut bytes = vec![0x5A; 0x400];
-        bytes[..4].copy_from_slice(&stack_pointer.to_le_bytes());
-        bytes[4..8].copy_from_slice(&vector.to_le_bytes());
-        judge(&raw::read(&bytes, Some(at)).unwrap(), at, None)
+        judge(&program(stack_pointer, vector, at), at, None)
     }
 
     #[test]
@@ -427,10 +420,7 @@ mod tests {
 
     #[test]
     fn an_image_without_addresses_is_judged_by_the_place_that_it_goes_to() {
-        let mut bytes = vec![0x5A; 0x400];
-        bytes[..4].copy_from_slice(&0x2001_0000_u32.to_le_bytes());
-        bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
-        let image = raw::read(&bytes, Some(0)).unwrap();
+        let image = program(0x2001_0000, 0x0801_0189, 0);
         let region = |first| AddressRange { first, last: first + 0xFFFF };
         assert_eq!(judge_place(&image, region(START)), Ok(()));
         // In the region, but not in the image when that lies at the region's start.
@@ -504,6 +494,13 @@ mod tests {
         for (begin, words) in [
             (&[0x3D, 0xB8, 0xF3, 0x96][..], "is not a program but an image for MCUboot"),
             (b"PK\x03\x04", "is not a program but a zip archive"),
+            // RFC 1952 section 2.3.1; HTML; the pointer of Git LFS's specification; esptool's image of three segments.
+            (b"\x1F\x8B\x08", "is not a program but a gzip archive"),
+            (b"<!DOCTYPE html>", "is not a program but a page of the web"),
+            (b"version https://git-lfs.github.com/spec/v1", "is not a program but a pointer of Git LFS"),
+            (b"\xE9\x03\x02\x20", "is not a program but an image for an ESP32"),
+            // POSIX.1, "ustar Interchange Format": the magic follows 257 bytes.
+            (&[&[b'f'; 257][..], b"ustar"].concat(), "is not a program but a tar archive"),
             (&[], "is linked for 08010200h, and the program begins at 08010000h"),
         ] {
             let mut bytes = begin.to_vec();
@@ -520,11 +517,12 @@ mod tests {
     /// A file of the production: other data, a gap or fill bytes, and the program.
     #[test]
     fn a_factory_file_is_named_with_the_place_of_its_program() {
-        for other in [0x0800_0000, 0x0800_C000] {
+        // The program may have been signed for MCUboot.
+        for (other, stack) in [(0x0800_0000, 0x2001_0000), (0x0800_C000, 0x96F3_B83D)] {
             for fill in [0, 0xFF] {
                 let mut bytes = vec![fill; (START - other) as usize];
                 bytes[..8].copy_from_slice(b"CAL1\0\0\0\0");
-                bytes.extend(program(0x2001_0000, START + 0x189, START).bytes::<0x400>(START).unwrap());
+                bytes.extend(program(stack, START + 0x189, START).bytes::<0x400>(START).unwrap());
                 let image = raw::read(&bytes, Some(other)).unwrap();
                 let fault = Fault::Merged { other, program: START };
                 assert_eq!(judge(&image, other, None), Err(fault));

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use shared_abi::layout::Layout;
+use shared_abi::layout::{Layout, BOARDS};
 
 use super::fault::Place;
 use super::range::AddressRange;
@@ -27,14 +27,22 @@ pub enum Note {
     NoLoadAddress(AddressRange),
     /// The program covers flash from this address on that a new bootloader needs.
     CoversStaging(u32),
+    /// The same, for a board of this name: the board of the device is not known.
+    CoversStagingOf(&'static str, u32),
 }
 
 impl Note {
-    /// The note about a program that ends at `last`, for this board.
+    /// The note about a program from `first` to `last`, for this board, or for the first one with such a program.
     #[must_use]
-    pub fn of_staging(last: u32, board: Option<&Layout>) -> Option<Self> {
-        let staging = board?.staging?;
-        (staging.base..staging.end()).contains(&last).then_some(Self::CoversStaging(staging.base))
+    pub fn of_staging(AddressRange { first, last }: AddressRange, board: Option<&Layout>) -> Option<Self> {
+        let covered = |board: &Layout| {
+            let staging = board.staging.filter(|staging| AddressRange::from(*staging).has(last))?;
+            board.programs.iter().any(|region| AddressRange::from(*region).has(first)).then_some(staging.base)
+        };
+        match board {
+            Some(board) => covered(board).map(Self::CoversStaging),
+            None => BOARDS.iter().find_map(|board| Some(Self::CoversStagingOf(board.board, covered(board)?))),
+        }
     }
 }
 
@@ -54,6 +62,7 @@ impl fmt::Display for Note {
                  bootloader can be renewed, the program has to be erased; {}",
                 Advice::EndBeforeStaging
             ),
+            Self::CoversStagingOf(board, first) => write!(f, "on {board} {}", Self::CoversStaging(*first)),
             Self::NoLoadAddress(range) => write!(
                 f,
                 "the data at {range} were left out: they are for the RAM, and no segment has a load address in the \

@@ -45,9 +45,7 @@ impl Format {
             _ => None,
         }
     }
-}
 
-impl Format {
     /// The format of a file with this name: that of its first bytes, and without distinctive bytes
     /// that of a raw binary if the name ends with `.bin`.
     #[must_use]
@@ -55,9 +53,7 @@ impl Format {
         let is_bin = name.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("bin"));
         Self::detect(bytes).or_else(|| (is_bin && !bytes.is_empty()).then_some(Self::Raw))
     }
-}
 
-impl Format {
     /// Its name.
     const fn name(self) -> &'static str {
         match self {
@@ -150,7 +146,9 @@ fn read_telling(
         Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
         Format::SRecord => srec::read(bytes).map(Firmware::Image),
         Format::Elf => elf::read(bytes).map(Firmware::Image),
-        Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
+        Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image).map_err(|fault| {
+            foreign::of_image(bytes).map_or(fault, |foreign| Place::File.fault(Cause::Foreign(foreign)))
+        }),
         Format::BlockFile if !blocks::looks_like(bytes) => block_file::read(bytes).map(Firmware::Blocks),
         // The contents of the blocks are not a program for the flash.
         Format::BlockFile | Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
