@@ -28,11 +28,6 @@ const EXAMPLES: [[&str; 2]; 5] = [
 /// time stamps that are not used.
 const OF_EMBASSY: [u32; 2] = [0x4002_388C, 0x4000_6400];
 
-/// Whether the tests run for the board of the examples.
-fn is_board_of_examples() -> bool {
-    firmware::board() == &stm32f407g_disc1::LAYOUT
-}
-
 /// The label of an image, which must be complete and at its place.
 fn label_of(image: &str) -> Label {
     let bytes = firmware::raw_from(stm32f407g_disc1::LAYOUT.programs[0].base, image);
@@ -44,9 +39,6 @@ fn label_of(image: &str) -> Label {
 /// runs again after a power-off.
 #[test]
 fn each_is_installed_and_updates_itself_over_socketcand() {
-    if !is_board_of_examples() {
-        return;
-    }
     EXAMPLES.into_iter().for_each(install_and_update);
 }
 
@@ -54,21 +46,15 @@ fn each_is_installed_and_updates_itself_over_socketcand() {
 #[test]
 #[ignore = "needs the image that `cargo xtask examples template` builds"]
 fn a_project_of_the_template_is_installed_and_updates_itself() {
-    if is_board_of_examples() {
-        install_and_update(["example-template.elf", "example-no-stack-v2.elf"]);
-    }
+    install_and_update(["example-template.elf", "example-no-stack-v2.elf"]);
 }
 
 /// flip-link puts the variables at the end of the RAM, and the stack below them (its README).
 #[test]
-#[ignore = "needs the image that `cargo xtask examples flip-link` builds"]
 fn a_program_of_flip_link_is_installed_and_updates_itself() {
-    if is_board_of_examples() {
-        let stack =
-            firmware::raw("example-flip-link.elf").first_chunk().map(|word| u32::from_le_bytes(*word));
-        assert!(stack < Some(firmware::board().ram.end()), "{stack:x?}");
-        install_and_update(["example-flip-link.elf", "example-no-stack-v2.elf"]);
-    }
+    let stack = firmware::raw("example-flip-link.elf").first_chunk().map(|word| u32::from_le_bytes(*word));
+    assert!(stack < Some(firmware::board().ram.end()), "{stack:x?}");
+    install_and_update(["example-flip-link.elf", "example-no-stack-v2.elf"]);
 }
 
 fn install_and_update(versions: [&str; 2]) {
@@ -106,18 +92,14 @@ fn install_and_update(versions: [&str; 2]) {
 /// When they reset, the answer to 80h is complete on the bus, and 10 ms more have passed.
 #[test]
 fn each_can_be_called_back_at_every_bit_rate() {
-    if is_board_of_examples() {
-        EXAMPLES.concat().into_iter().for_each(|name| call_back::at_every_bit_rate(name, |_, _| {}));
-    }
+    EXAMPLES.concat().into_iter().for_each(|name| call_back::at_every_bit_rate(name, |_, _| {}));
 }
 
 /// The one on Embassy waits for its crystal without a bound, in the start of embassy-stm32.
 #[test]
 fn each_leaves_for_the_bootloader_when_its_crystal_fails() {
-    if is_board_of_examples() {
-        let without_embassy = EXAMPLES.into_iter().filter(|[name, _]| *name != "example-embassy.elf");
-        without_embassy.for_each(|[name, _]| dead_crystal::brings_the_bootloader(&firmware::blocks(name)));
-    }
+    let without_embassy = EXAMPLES.into_iter().filter(|[name, _]| *name != "example-embassy.elf");
+    without_embassy.for_each(|[name, _]| dead_crystal::brings_the_bootloader(&firmware::blocks(name)));
 }
 
 /// A copy of the example in C, to build it with a mistake.

@@ -16,9 +16,9 @@ usage: cargo xtask examples [NAME...]
 
 Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
 target/firmware/stm32f407g-disc1/example-NAME.elf. A NAME is a folder of examples/, or with -v2 the same
-program as version 2 (c-v2 and cpp-v2 by clang). Without a NAME it builds all of them, but not these two,
-whose tools are built first, which takes some minutes once: `template`, a new project, which `cargo generate`
-makes of no-stack, and `flip-link`, which is no-stack linked by flip-link.
+program as version 2 (c-v2 and cpp-v2 by clang). `flip-link` is no-stack linked by flip-link, which is installed
+into target/tools. Without a NAME it builds all of these. `template` is a new project, which `cargo generate` makes
+of no-stack; its tool is built first, which takes some minutes once.
 ";
 
 /// The board of all examples: their pages name it.
@@ -42,7 +42,7 @@ const FLIP_LINK: (&str, &str) = ("flip-link", "0.1.12");
 
 pub fn run(args: Args) -> Outcome {
     let chosen = args.remaining();
-    let known: Vec<String> = names().chain([TEMPLATE.to_owned(), FLIP_LINK.0.to_owned()]).collect();
+    let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
     if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
         return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));
     }
@@ -53,14 +53,15 @@ pub fn run(args: Args) -> Outcome {
     chosen.iter().try_for_each(|name| build(name))
 }
 
-/// Builds all examples but the template, and prints their sizes. The tools must be installed.
+/// Builds all examples but the template, and prints their sizes. The tools of [`Part::Examples`] must be installed.
 pub fn all() -> Outcome {
     names().try_for_each(|name| build(&name))
 }
 
 /// The names of all examples but the template.
 fn names() -> impl Iterator<Item = String> {
-    EXAMPLES.iter().flat_map(|(folder, _)| [(*folder).to_owned(), format!("{folder}-v2")])
+    let versions = EXAMPLES.iter().flat_map(|(folder, _)| [(*folder).to_owned(), format!("{folder}-v2")]);
+    versions.chain([FLIP_LINK.0.to_owned()])
 }
 
 fn build(name: &str) -> Outcome {
