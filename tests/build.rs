@@ -15,6 +15,8 @@ fn main() {
         ("split_map", board.home.is_some()),
         // A renewal of the bootloader.
         ("staging", board.staging.is_some()),
+        // The chip of the boards with CAN2 and with two programs.
+        ("reference_chip", board.chip == stm32f407g_disc1::LAYOUT.chip),
         // Pages, guides and the projects that they describe are for one board.
         ("reference_board", board.board == stm32f407g_disc1::LAYOUT.board),
     ] {

@@ -10,15 +10,6 @@ use coflash_core::update::{flash, FlashOptions};
 use emulator::peripheral::Peripheral;
 use shared_abi::layout::stm32f407g_disc1_can2::LAYOUT;
 
-/// Whether the tests run for the chip of this board.
-fn is_its_chip() -> bool {
-    let same = firmware::board().chip == LAYOUT.chip;
-    if !same {
-        println!("not run: {} has the chip of another board", LAYOUT.board);
-    }
-    same
-}
-
 fn bench_at(controller: u8) -> Bench {
     Bench::of_image_at(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER), controller)
 }
@@ -90,9 +81,6 @@ fn taken(bench: &mut Bench, line: usize) -> u64 {
 
 #[test]
 fn an_update_and_the_way_back_through_can2() {
-    if !is_its_chip() {
-        return;
-    }
     let mut bench = bench_at(2).switched_on();
     assert!(bench.is_bootloader(1));
     // Tasks of priority 2 and 3 out of 16, in the upper four bits, where 0 is the highest.
@@ -130,9 +118,6 @@ fn an_update_and_the_way_back_through_can2() {
 /// The frames that the test above receives come from CAN2.
 #[test]
 fn nothing_comes_out_of_can1() {
-    if !is_its_chip() {
-        return;
-    }
     let mut bench = bench_at(1);
     bench.power_on();
     bench.run_ms(500);
@@ -144,9 +129,6 @@ fn nothing_comes_out_of_can1() {
 /// stay unchanged.
 #[test]
 fn the_filters_of_can1_stay() {
-    if !is_its_chip() {
-        return;
-    }
     let mut bench = bench_at(2).switched_on();
     // Banks 0 and 13, CAN1's first and last: one filter of 32 bits each for FIFO 1, and bank 13
     // active.

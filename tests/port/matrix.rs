@@ -32,17 +32,13 @@ const DIALECTS: [Dialect; 4] = [
     LIFT,
 ];
 
-/// A running board with this bootloader; none if the tests run for another chip.
-fn board(bootloader: &str) -> Option<Bench> {
-    if firmware::board().chip != LAYOUT.chip {
-        println!("not run: {} has the chip of another board", LAYOUT.board);
-        return None;
-    }
+/// A running board with this bootloader.
+fn board(bootloader: &str) -> Bench {
     println!("{bootloader}");
     let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, &format!("{bootloader}.elf")));
     bench.power_on();
     bench.run_ms(50);
-    Some(bench)
+    bench
 }
 
 /// An image with CAN.
@@ -84,7 +80,7 @@ fn play(wire: &mut dyn Wire, dialect: &Dialect, application: &str, image: &dyn F
 fn logs(way: &str, listener: impl Fn(&str) -> Listener) {
     for dialect in &DIALECTS {
         let name = format!("bootloader-log-{way}{}", dialect.name);
-        let Some(mut bench) = board(&name) else { return };
+        let mut bench = board(&name);
         let mut listener = listener(&firmware::of_board(LAYOUT.board, &format!("{name}.elf")));
         // 6: no valid program.
         let lines = listener.lines(&mut bench);
@@ -123,7 +119,7 @@ fn each_dialect_tells_a_terminal() {
 #[test]
 fn each_dialect_plays_its_session_over_uart() {
     for dialect in &DIALECTS {
-        let Some(bench) = board(&format!("bootloader-virtual-can{}", dialect.name)) else { return };
+        let bench = board(&format!("bootloader-virtual-can{}", dialect.name));
         let mut bus = TextBus::new(bench);
         play(&mut bus, dialect, "app-virtual-can-lift.elf", &serial_image);
         assert!(bus.bench.records().is_empty(), "something was on the CAN bus");
@@ -133,7 +129,7 @@ fn each_dialect_plays_its_session_over_uart() {
 
 #[test]
 fn a_lift_takes_hex_and_a_set_of_parameters_and_speaks_lss() {
-    let Some(mut bench) = board("bootloader-lift") else { return };
+    let mut bench = board("bootloader-lift");
     play_on(&mut bench, "lift_lss_hex.candump", &LAYOUT, &image);
     // The received text was stored as the image.
     let mut session = bench.session();
@@ -149,7 +145,7 @@ fn a_lift_takes_hex_and_a_set_of_parameters_and_speaks_lss() {
 
 #[test]
 fn the_boot_loader_of_esacademy_has_two_programs() {
-    let Some(mut bench) = board("bootloader-esacademy") else { return };
+    let mut bench = board("bootloader-esacademy");
     script::play_on(&mut bench, "esacademy_two.candump", &LAYOUT, &image);
     bench.assert_nothing_unmodelled();
 }
@@ -158,7 +154,7 @@ fn the_boot_loader_of_esacademy_has_two_programs() {
 /// single master under the node-ID of this dialect.
 #[test]
 fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
-    let Some(mut bench) = board("bootloader-esacademy") else { return };
+    let mut bench = board("bootloader-esacademy");
     bench.post(0x7E5, &[0x04, 0x01, 0, 0, 0, 0, 0, 0]);
     for request in [[0x13, 0, 9, 0, 0, 0, 0, 0], [0x17, 0, 0, 0, 0, 0, 0, 0]] {
         bench.assert_answer(0x7E5, &request, 0x7E4, &[request[0], 0, 0, 0, 0, 0, 0, 0]);
@@ -192,7 +188,7 @@ fn the_boot_loader_of_esacademy_finds_the_bit_rate() {
 /// The interface shows the data decoded from the text.
 #[test]
 fn a_bootloader_with_the_debugger_takes_hex() {
-    let Some(mut bench) = board("bootloader-debugger") else { return };
+    let mut bench = board("bootloader-debugger");
     let base = LAYOUT.programs[0].base;
     let program = firmware::raw_from(base, &image(firmware::APP_V1));
     let mut session = bench.session();
@@ -217,7 +213,7 @@ fn a_bootloader_with_the_debugger_takes_hex() {
 fn a_product_with_crc_16_is_updated_by_block_file() {
     use coflash_core::file::checksum::Checksum;
 
-    let Some(mut bench) = board("bootloader-crc-16") else { return };
+    let mut bench = board("bootloader-crc-16");
     let file = |checksum| {
         let firmware = read(&firmware::elf(&image(firmware::APP_V1)), None, None).unwrap();
         let region = Region::Strict(LAYOUT.programs[0].into());
