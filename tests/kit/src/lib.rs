@@ -10,6 +10,7 @@
 //! | `pages` | the commands on the pages of the documentation |
 //! | `fake` | feature `fake`: devices with virtual time, as adapters and behind a socketcand server |
 //! | `hawkbit` | feature `hawkbit`: a hawkBit server with faults |
+//! | `http` | feature `http`: a page of `coflash ui` without a browser |
 //! | `bus` | feature `bus`: a CANopen device with a domain, and frames to it and from it |
 //! | `memory` | feature `debugger`: a device with the debugger interface, and its memory |
 //! | `model` | feature `boot`: a strict flash that loses power on demand |
@@ -41,6 +42,9 @@ pub mod folder;
 #[cfg(feature = "hawkbit")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod hawkbit;
+#[cfg(feature = "http")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod http;
 pub mod ihex;
 #[cfg(feature = "debugger")]
 #[allow(missing_docs, reason = "names say it")]

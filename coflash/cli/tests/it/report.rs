@@ -2,8 +2,7 @@
 
 use std::collections::HashSet;
 use std::fs;
-use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpStream;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -15,7 +14,8 @@ use coflash_core::machine::zip;
 use kit::fake::{serve, Outcome, BOOTLOADER};
 use kit::folder::Folder;
 use kit::hawkbit::{Action, File, Server};
-use serde_json::Value;
+use kit::http::Page;
+use serde_json::{json, Value};
 
 /// A run in the folder, recorded in `reports`.
 fn recorded(folder: &Folder, words: &[&str], variables: &[(&str, &str)]) -> Done {
@@ -225,18 +225,7 @@ fn what_is_stopped_leaves_its_reports() {
     let mut line = String::new();
     BufReader::new(station.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
     let page: Value = serde_json::from_str(&line).unwrap();
-    let page = page["url"].as_str().unwrap().strip_prefix("http://").unwrap();
-    let (host, path) = page.split_once('/').unwrap();
-    let post = |what: &str, body: &str| {
-        let mut stream = TcpStream::connect(host).unwrap();
-        let head =
-            format!("POST /{path}{what} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n");
-        let length = body.len();
-        write!(stream, "{head}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        answer.starts_with("HTTP/1.1 200")
-    };
+    let page = Page::at(page["url"].as_str().unwrap());
     let until = |what: &str, is_so: &dyn Fn() -> bool| {
         let is_so_now = |_: &usize| {
             thread::sleep(Duration::from_millis(10));
@@ -244,9 +233,9 @@ fn what_is_stopped_leaves_its_reports() {
         };
         assert!((0..2000).find(is_so_now).is_some(), "{what} never comes");
     };
-    until("the search", &|| post("search", "{}"));
-    let order = r#"{"plan":1,"nodes":[5],"operator":"","order":"","device_number":"","language":"en"}"#;
-    until("the update", &|| post("update", order));
+    until("the search", &|| page.post("search", &json!({})).status == 200);
+    let order = json!({ "plan": 1, "nodes": [5], "operator": "", "order": "", "device_number": "", "language": "en" });
+    until("the update", &|| page.post("update", &order).status == 200);
     let of_device =
         |ending: &str| runs(&folder).into_iter().find(|path| path.to_string_lossy().ends_with(ending));
     until("its beginning", &|| of_device("_begun.csv").is_some());

@@ -1,10 +1,10 @@
-//! The server of `coflash ui` without a browser: access control, and hostile requests. Requests are
-//! written byte by byte, because no library would send them.
+//! The server of `coflash ui` without a browser: access control, and hostile requests.
 
 mod service;
 
-use std::io::{ErrorKind, Read, Write};
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::ops::Deref;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -17,31 +17,21 @@ use serde_json::{json, Value};
 
 use kit::fake::vault::Vault;
 use kit::fake::{Bus, Fake, Outcome};
-
-/// How long something may take before it counts as hanging. It measures nothing.
-const PATIENCE: Duration = Duration::from_secs(120);
+use kit::http::{Answer, Page, PATIENCE};
 
 /// A server of one test.
 struct Ui {
-    /// `127.0.0.1:PORT`.
-    host: String,
-    /// `/TOKEN/`.
-    path: String,
+    page: Page,
     readers: Box<dyn Fn() -> usize + Send>,
     end: Arc<AtomicBool>,
     thread: Option<JoinHandle<Option<String>>>,
 }
 
-/// What the server answered.
-struct Answer {
-    status: u16,
-    head: String,
-    body: String,
-}
+impl Deref for Ui {
+    type Target = Page;
 
-impl Answer {
-    fn json(&self) -> Value {
-        serde_json::from_str(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.body))
+    fn deref(&self) -> &Page {
+        &self.page
     }
 }
 
@@ -57,111 +47,17 @@ impl Ui {
         // A test touches no adapter of this machine.
         options.kinds = Vec::new();
         let server = Server::new(options).unwrap();
-        let url = server.url();
-        let (host, token) = url.strip_prefix("http://").unwrap().split_once('/').unwrap();
-        let (host, path) = (host.to_string(), format!("/{token}"));
+        let page = Page::at(&server.url());
         let readers = Box::new(server.readers());
         let end = Arc::new(AtomicBool::new(false));
         let flag = end.clone();
         let thread = Some(thread::spawn(move || server.run(&flag).unwrap()));
-        Self { host, path, readers, end, thread }
-    }
-
-    fn stream(&self) -> TcpStream {
-        let stream = TcpStream::connect(&self.host).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        stream
-    }
-
-    /// Sends these bytes, and reads all of the answer.
-    fn raw(&self, request: &[u8]) -> Answer {
-        let mut stream = self.stream();
-        // It may answer and close the connection before it has received all.
-        let _ = stream.write_all(request);
-        let mut answer = Vec::new();
-        let mut part = [0; 4096];
-        loop {
-            match stream.read(&mut part) {
-                Ok(0) => break,
-                Ok(len) => answer.extend_from_slice(&part[..len]),
-                Err(error) if error.kind() == ErrorKind::ConnectionReset => break,
-                Err(error) => panic!("{error}"),
-            }
-        }
-        let text = String::from_utf8(answer).unwrap();
-        let (head, body) = text.split_once("\r\n\r\n").unwrap_or((&text, ""));
-        let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap_or(0);
-        Answer { status, head: head.to_lowercase(), body: body.to_string() }
-    }
-
-    /// A request with these header lines and those that HTTP requires.
-    fn request(&self, method: &str, path: &str, lines: &[&str], body: &[u8]) -> Answer {
-        let mut request = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
-        for line in lines {
-            request += &format!("{line}\r\n");
-        }
-        if !body.is_empty() {
-            request += &format!("Content-Length: {}\r\n", body.len());
-        }
-        self.raw(&[request.as_bytes(), b"\r\n", body].concat())
-    }
-
-    fn host_line(&self) -> String {
-        format!("Host: {}", self.host)
-    }
-
-    fn get(&self, what: &str) -> Answer {
-        self.request("GET", &format!("{}{what}", self.path), &[&self.host_line()], b"")
-    }
-
-    fn post(&self, what: &str, value: &Value) -> Answer {
-        let lines = [self.host_line(), "Content-Type: application/json".to_string()];
-        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
-        self.request("POST", &format!("{}{what}", self.path), &lines, value.to_string().as_bytes())
+        Self { page, readers, end, thread }
     }
 
     fn file(&self, name: &str, bytes: &[u8]) -> Answer {
         let what = if name.to_ascii_lowercase().ends_with(".toml") { "board" } else { "firmware" };
         self.request("POST", &format!("{}{what}?name={name}", self.path), &[&self.host_line()], bytes)
-    }
-
-    /// A reader of the events, which has read the status of the answer.
-    fn events(&self, query: &str) -> TcpStream {
-        let mut stream = self.stream();
-        let request = format!("GET {}events{query} HTTP/1.1\r\n{}\r\n\r\n", self.path, self.host_line());
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut head = [0; 12];
-        stream.read_exact(&mut head).unwrap();
-        assert_eq!(&head, b"HTTP/1.1 200");
-        stream
-    }
-
-    /// Follows the events until `wanted` accepts the state; returns the state.
-    #[track_caller]
-    fn until(&self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
-        let mut stream = self.events("");
-        let mut text = Vec::new();
-        let mut last = Value::Null;
-        let began = std::time::Instant::now();
-        while began.elapsed() < PATIENCE {
-            let mut part = [0; 16 * 1024];
-            let len = stream.read(&mut part).unwrap();
-            assert!(len > 0, "{what}: the events ended; the last state was {last}");
-            text.extend_from_slice(&part[..len]);
-            while let Some(end) = text.windows(2).position(|two| two == b"\n\n") {
-                let event: Vec<u8> = text.drain(..end + 2).collect();
-                let event = String::from_utf8_lossy(&event);
-                let Some(data) = event.lines().find_map(|line| line.strip_prefix("data: ")) else { continue };
-                let value: Value = serde_json::from_str(data).unwrap();
-                if !value["state"].is_null() {
-                    last = value["state"].clone();
-                    if wanted(&last) {
-                        return last;
-                    }
-                }
-            }
-        }
-        panic!("{what}: it never comes; the last state was {last}");
     }
 
     fn finish(mut self) -> Option<String> {

@@ -14,6 +14,7 @@ use embedded_can::{Frame as _, StandardId};
 use kit::fake::lift::{Lift, PHRASE};
 use kit::fake::{Bus, Fake, Maker, Outcome, APPLICATION};
 use kit::folder::Folder;
+use kit::http::Answer;
 use serde_json::{json, Value};
 
 use super::{Ui, HEX};
@@ -77,7 +78,7 @@ fn planned(ui: &Ui) -> Value {
 }
 
 /// Confirms a plan for these nodes.
-fn confirm(ui: &Ui, plan: &Value, nodes: &[u8]) -> super::Answer {
+fn confirm(ui: &Ui, plan: &Value, nodes: &[u8]) -> Answer {
     ui.post("update", &confirmed(plan, nodes))
 }
 
