@@ -18,8 +18,8 @@ pub enum DeviceState {
     Begun,
     /// The bootloader was called; the old program is intact.
     Called,
-    /// The device has postponed the erase until the first good data, and has acknowledged none: the old
-    /// program may be intact.
+    /// The device has not acknowledged the erase, or has postponed it until the first good data, and has
+    /// acknowledged none: the old program may be intact.
     Postponed,
     /// The erase was started: as far as is known, there is no program, or an incomplete one.
     Erased,
@@ -54,7 +54,7 @@ impl fmt::Display for DeviceState {
             Self::Untouched => "it was not changed",
             Self::Begun => "an earlier attempt has begun with it, and may have changed it",
             Self::Called => "it was called back to the bootloader, and its program is unchanged",
-            Self::Postponed => "it erases its program with the first good data, and has acknowledged none of the new one",
+            Self::Postponed => "it was told to erase its program, and has acknowledged nothing of the new one: it may have the old one",
             Self::Erased => "it contains no complete program",
             Self::Written => "it contains the new program, which starts after a reset",
             Self::Unreleased => {

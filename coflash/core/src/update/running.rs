@@ -46,7 +46,8 @@ pub struct Known {
     pub(super) state_before: DeviceState,
     /// The value of 1F56h before the erase, if it was read.
     pub(super) before: Option<u32>,
-    /// Whether the device has postponed the erase, and has acknowledged no data since then.
+    /// Whether the device has not acknowledged the erase yet, or has postponed it and has acknowledged no data
+    /// since then.
     pub(super) postponed: bool,
     /// Whether the device may contain a part of the new program.
     pub(super) wrote: bool,
@@ -180,6 +181,10 @@ impl<'t> RunningUpdate<'t> {
     /// Reports an event.
     pub(super) fn report(&mut self, event: Event) {
         match &event {
+            // Until the device has said that it is done, it may have its program.
+            Event::Phase(Phase::Erasing) => {
+                self.known.postponed = !self.known.wrote && self.known.before != Some(0)
+            }
             Event::Phase(Phase::Erased { took }) => {
                 self.known.postponed = *took < PUT_OFF && !self.known.wrote
             }

@@ -173,9 +173,14 @@ fn without_an_answer_a_postponed_erase_is_not_called_done() {
         assert_eq!((first.state, first.answer), (DeviceState::Postponed, DeviceAnswer::NotAsked), "{kind}");
         assert_eq!(
             first.to_string(),
-            "it cannot be asked any more; last known: it erases its program with the first good data, and has \
-             acknowledged none of the new one"
+            "it cannot be asked any more; last known: it was told to erase its program, and has acknowledged \
+             nothing of the new one: it may have the old one"
         );
+        // Also one that is long about the erase may not have begun with it: CLEAR has no answer, or 1F57h.
+        for frames in [begin - 2, begin] {
+            let unheard = |fake: &mut Fake| (fake.crc, fake.frames_left) = (Some(0x0BAD_CAFE), frames);
+            assert_eq!(left(BOOTLOADER, &unheard, dialect(kind)).state, DeviceState::Postponed, "{kind}");
+        }
         let mut states = Vec::new();
         for frames in begin..command(1).unwrap_or(whole.sent.len()) {
             states.push(
