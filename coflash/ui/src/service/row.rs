@@ -168,7 +168,13 @@ impl Row {
             (RowState::Failed, Some("left-none")) => "state-empty",
             (RowState::Failed, Some("left-new")) => "state-new",
             (RowState::Failed, Some("left-unknown")) => "state-unknown",
-            (RowState::Failed, None) if self.missing.is_some() => "state-missing",
+            // One that answers in a wrong way is not missing.
+            (RowState::Failed, None)
+                if self.missing.is_some()
+                    && self.trouble.as_ref().is_none_or(|why| why.key != "trouble-mute") =>
+            {
+                "state-missing"
+            }
             (RowState::Failed, None) => "state-left-alone",
             (state, _) => state.into(),
         }
