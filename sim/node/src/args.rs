@@ -90,6 +90,10 @@ pub struct Args {
     #[arg(long)]
     pub stand_in: bool,
 
+    /// The stand-in refuses each command to leave, as an application does whose machine moves
+    #[arg(long)]
+    pub refuse: bool,
+
     /// Start this program of the host in place of a downloaded program, and end it when the device
     /// leaves the program: COMMAND gets the file with the downloaded bytes as its only argument.
     /// Includes --stand-in. Whoever reaches the bus decides what COMMAND reads

@@ -58,6 +58,8 @@ pub struct Setup {
     pub config: &'static bootloader::Config,
     /// The object dictionary of the stand-in; `None` for a silent program.
     pub stand_in: Option<&'static [Entry]>,
+    /// The stand-in refuses each command to leave.
+    pub refuses: bool,
     /// 1018h/4.
     pub serial_number: u32,
     /// Node-ID and bit rate until other values are stored.
@@ -259,7 +261,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
 
     /// The boot stage: selects bootloader or program.
     fn reset(&mut self, idle: Idle<'b>, cause: ResetCause, request: Option<BootRequest>) -> Event {
-        let Setup { config, stand_in, serial_number, node, strap } = self.setup;
+        let Setup { config, stand_in, refuses, serial_number, node, strap } = self.setup;
         let Idle { mut flash, buffer } = idle;
         let mut journal = Journal::open(&flash, config.layout.parameters);
         let node = NodeParameters::load(&journal, &flash, node, supports);
@@ -327,8 +329,9 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                             let process = Process::start(command, &file, &program, place);
                             Hosted { number, process, leaving: None }
                         });
-                        let device =
+                        let mut device =
                             StandIn::new(entries, identity, &start, hands_over, flash, config.layout);
+                        device.refuses = refuses;
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
                         Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer, hosted)

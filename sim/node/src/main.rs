@@ -153,6 +153,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         Some(Setup {
             config,
             stand_in,
+            refuses: args.refuse,
             serial_number: args.serial.checked_add(n.into())?,
             node: NodeParameters { id, bit_rate: BitRate::K125 },
             strap: args.stay,

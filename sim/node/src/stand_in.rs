@@ -30,6 +30,8 @@ pub struct StandIn {
     device: Device,
     /// 1F51h, 1F56h, 1F57h, and the way back.
     pub control: ProgramControl,
+    /// It refuses each command to leave.
+    pub refuses: bool,
     underneath: Underneath,
     /// The time that was set last.
     now: Instant,
@@ -91,7 +93,7 @@ impl StandIn {
         let crc = underneath.program_info(start.program).map_or(0, |info| info.crc);
         let control = ProgramControl::new(start, layout, crc);
         let control = if hands_over { control } else { control.answering_itself() };
-        Self { entries, device, control, underneath, now: Instant::from_millis(0) }
+        Self { entries, device, control, refuses: false, underneath, now: Instant::from_millis(0) }
     }
 
     /// Its object dictionary on a device with this many programs.
@@ -149,6 +151,9 @@ impl Objects for StandIn {
     fn write_with_reply(&mut self, at: Address, data: &[u8], expedited: bool) -> Result<Reply, AbortCode> {
         if at.index != PROGRAM_CONTROL {
             return Err(AbortCode::UNSUPPORTED_ACCESS);
+        }
+        if self.refuses {
+            return Err(AbortCode::DEVICE_STATE);
         }
         let now = self.now.as_millis();
         Ok(self.control.write(at.sub, data, expedited, now, &mut self.underneath)?.into())

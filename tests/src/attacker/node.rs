@@ -98,6 +98,7 @@ impl Node {
         let setup = Setup {
             config,
             stand_in: Some(Vec::leak(StandIn::entries(2))),
+            refuses: false,
             serial_number: 1,
             node: NodeParameters { id: Some(default.0), bit_rate: default.1 },
             strap: false,
