@@ -6,7 +6,9 @@ runs this file.
 
 import ast
 import inspect
+import json
 import os
+import pathlib
 import queue
 import signal
 import subprocess
@@ -277,41 +279,97 @@ def test_the_package_is_typed():
     assert coflash.__version__.count(".") == 2
 
 
-@pytest.mark.parametrize("dies", [False, True])
-def test_what_is_said_is_in_the_flash(tmp_path, dies):
-    """Two versions with their own CRC-32 at the end have one CRC; a device may lose its power in the second one."""
+FATES = ("", "absent", "cut-before", "dies", "returns", "unplugged", "KILL")
+OPTIONS = {"--no-start": {"start": False}, "--no-trial": {"trial_run": False}}
 
-    def version(number: int) -> bytes:
-        data = program()[:8] + bytes([number]) * (100 * 1024)
-        return data + crc32(data).to_bytes(4, "little")
 
-    def held() -> bytes:
-        return (tmp_path / "1.flash").read_bytes()[0x2_0000:][: len(version(1))]
+def rows():
+    """The rows of the table of `coboot-node` (sim/node/tests/it/outcomes.rs) that this file can make: those for one
+    device with raw images."""
+    table = pathlib.Path(__file__).parents[3] / "sim/node/tests/it/outcomes.json"
+    for row in json.loads(table.read_text()):
+        files = row["before"] + row["gets"]
+        is_raw = all(letter in "0123456789-pzd" for letter in files) and row["gets"][2] == "0"
+        if is_raw and "one" in row.get("ways", "one").split() and row.get("fate", "") in FATES:
+            yield pytest.param(row, id=row["what"])
 
-    speed = "typical" if dies else "instant"
-    with Nodes(tmp_path, "--node", "77", "--serial", "77") as bus:
-        device = [os.environ["COBOOT_NODE"], "--bus", bus.bus, "--node", "5", "--flash", speed, "--stand-in"]
-        process = subprocess.Popen(device, cwd=tmp_path)
+
+def file(name: str) -> bytes:
+    """The image of a file of the table: plain, or with its own CRC-32 at the end as zlib or DFU have it."""
+    data = program()[:8] + name[:1].encode() * (96 * 1024 - 8)
+    if name[3] == "p":
+        return data
+    return data[:-4] + (zlib.crc32(data[:-4]) ^ (0xFFFF_FFFF if name[3] == "d" else 0)).to_bytes(4, "little")
+
+
+def options(words: str) -> dict:
+    first, *more = words.split() or [""]
+    return {"unlock": more[0]} if first == "--unlock" else OPTIONS.get(first, {})
+
+
+class Enough(Exception):
+    """The listener ends the update."""
+
+
+@pytest.mark.parametrize("row", list(rows()))
+def test_what_is_said_is_in_the_flash(tmp_path, row):
+    """The reader is this file: it compares the bytes of the flash."""
+    fate, new = row.get("fate", ""), file(row["gets"])
+    script = tmp_path / "run.sh"
+    script.write_text("#!/bin/sh\ngrep -q 22222222 \"$1\" && exit 3\nexec sleep 1000\n")
+    script.chmod(0o755)
+    bus = Nodes(tmp_path, "--node", "77", "--serial", "77")
+
+    def switched_on():
+        node = "15" if fate == "absent" else "5"
+        speed = "typical" if fate in FATES[2:] else "instant"
+        words = [os.environ["COBOOT_NODE"], "--bus", bus.bus, "--node", node, "--flash", speed]
+        words += ["--vendor-id", "0x3F", "--product-code", "3", *row.get("device", "--stand-in").split()]
+        device = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+        assert "bootloader" in device.stdout.readline()
+        return device
+
+    def held(data=new):
+        return (tmp_path / "1.flash").read_bytes()[0x2_0000:][: len(data)]
+
+    def flash(name, strike, words=""):
+        """The state in the last event, and whether the update was good."""
+        path, events = tmp_path / f"{name}.bin", []
+        path.write_bytes(file(name))
+
+        def note(event):
+            events.append(event)
+            # The first bytes after the vectors are those of this file.
+            if strike and held()[8:8192] == file(name)[8:8192]:
+                strike()
+
         try:
-            for number in 1, 2:
-                path = tmp_path / f"{number}.bin"
-                path.write_bytes(version(number))
-                events = []
+            coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE, **options(words))
+        except (coflash.Error, Enough) as error:
+            return events[-1].get("state"), str(error)
+        return events[-1]["state"], None
 
-                def note(event):
-                    events.append(event)
-                    # The first bytes after the vectors are those of this version.
-                    if dies and number == 2 and held()[8:64] == version(2)[8:64]:
-                        process.kill()
+    def enough():
+        raise Enough
 
-                if dies and number == 2:
-                    with pytest.raises(coflash.Error):
-                        coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE)
-                    assert events[-1]["state"] == "erased"
-                    assert held() not in (version(1), version(2))
-                else:
-                    coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE)
-                    assert held() == version(number)
-        finally:
+    device = switched_on()
+    try:
+        if row["before"] and fate != "absent":
+            flash(row["before"], enough if fate == "cut-before" else None, row.get("before-with", ""))
+        before = held()
+        strikes = {"unplugged": bus.process.kill, "KILL": enough, "dies": device.kill, "returns": device.kill}
+        said, error = flash(row["gets"], strikes.get(fate), row.get("with", ""))
+        if fate in ("returns", "KILL"):
+            if fate == "returns":
+                device.wait()
+                device = switched_on()
+            said, error = flash(row["gets"], None)
+        # In the words of the table.
+        said = {"called": "untouched", "released": "updated", "written": "updated"}.get(said, said)
+        assert said == row["said"], error
+        has = "new" if held() == new else "old" if held() == before else "none"
+        assert has == {"untouched": "old", "erased": "none"}.get(said, "new"), error
+    finally:
+        for process in device, bus.process:
             process.kill()
             process.wait()

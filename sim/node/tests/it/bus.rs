@@ -56,15 +56,19 @@ impl Folder {
         fs::read(self.path(name)).unwrap()
     }
 
+    /// A part of a flash. The node replaces its file as a whole.
+    pub fn part(&self, name: &str, offset: usize, len: usize) -> Vec<u8> {
+        let mut bytes = vec![0; len];
+        let mut file = fs::File::open(self.path(name)).unwrap();
+        file.seek(SeekFrom::Start(offset as u64)).unwrap();
+        file.read_exact(&mut bytes).unwrap();
+        bytes
+    }
+
     /// Waits until a flash has other bytes than FFh at this offset.
-    pub fn await_bytes(&self, name: &str, offset: u64) {
-        let mut bytes = [0xFF; 64];
-        while bytes == [0xFF; 64] {
+    pub fn await_bytes(&self, name: &str, offset: usize) {
+        while self.part(name, offset, 64) == [0xFF; 64] {
             thread::sleep(Duration::from_millis(5));
-            // Each time another file: the node replaces it as a whole.
-            let mut file = fs::File::open(self.path(name)).unwrap();
-            file.seek(SeekFrom::Start(offset)).unwrap();
-            file.read_exact(&mut bytes).unwrap();
         }
     }
 }
