@@ -577,7 +577,7 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         let node = NodeParameters { id: NodeId::new(id), ..kit::bench::node() };
         let mut bench = reported(&mut flash, CONFIG, node, report);
         bench.node.node_id_changed(NodeId::new(5));
-        assert_eq!(bench.word(Address::new(0x2007, 2)), now.into(), "after {last}");
+        assert_eq!(bench.word(Address::new(0x2007, 2)), u32::from(now), "after {last}");
     }
     let report = BootReport {
         reason: Reason::Unsigned as u8,
