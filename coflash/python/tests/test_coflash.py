@@ -334,19 +334,32 @@ def test_what_is_said_is_in_the_flash(tmp_path, row):
 
     def flash(name, strike, words=""):
         """The state in the last event, and whether the update was good."""
-        path, events = tmp_path / f"{name}.bin", []
+        path, events, over = tmp_path / f"{name}.bin", [], threading.Event()
         path.write_bytes(file(name))
+
+        def is_in_the_middle():
+            # The first bytes after the vectors are those of this file.
+            return held()[8:8192] == file(name)[8:8192]
+
+        def watch():
+            while not over.wait(0.002):
+                if is_in_the_middle():
+                    return strike()
 
         def note(event):
             events.append(event)
-            # The first bytes after the vectors are those of this file.
-            if strike and held()[8:8192] == file(name)[8:8192]:
+            if strike is enough and is_in_the_middle():
                 strike()
 
+        watcher = threading.Thread(target=watch)
+        if strike not in (None, enough):
+            watcher.start()
         try:
             coflash.flash(bus.bus, 5, path, note, board=BOARD, address=BASE, **options(words))
         except (coflash.Error, Enough) as error:
             return events[-1].get("state"), str(error)
+        finally:
+            over.set()
         return events[-1]["state"], None
 
     def enough():
