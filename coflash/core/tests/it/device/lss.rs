@@ -240,10 +240,8 @@ fn a_device_that_goes_in_the_middle_ends_the_scan() {
     let mut bus = bus([Slave::new(ADDRESS, 0xFF)]);
     bus.gone_after = Some(20);
     let error = Master::new(&mut bus, ANSWER).fastscan(&mut |_| {}).unwrap_err();
-    assert!(
-        matches!(error, Error::Lss { doing: LssDoing::Fastscan, failure: LssFailure::NoAnswer }),
-        "{error}"
-    );
+    let is_silent = matches!(error, Error::Lss { doing: LssDoing::Fastscan, failure: LssFailure::NoAnswer });
+    assert!(is_silent, "{error}");
     assert_eq!((error.number(), error.to_string().as_str()), (0x6000_0013, "no device answers (fastscan)"));
 }
 
@@ -265,18 +263,14 @@ fn nobody_there_and_refusals_have_words() {
     let mut master = Master::new(&mut refusing, ANSWER);
     master.select(&ADDRESS).unwrap();
     let error = master.store().unwrap_err();
-    assert_eq!(
-        (error.number(), error.to_string().as_str()),
-        (0x6000_0201, "the device refuses storing node-ID and bit rate: error 1")
-    );
+    let words = "the device refuses storing node-ID and bit rate: error 1";
+    assert_eq!((error.number(), error.to_string().as_str()), (0x6000_0201, words));
     assert!(error.advice().to_string().contains("cannot store"));
     refusing.slaves[0].refusal = (0xFF, 7);
     let mut master = Master::new(&mut refusing, ANSWER);
     let error = master.set_bit_rate(BitRate::K800).unwrap_err();
-    assert_eq!(
-        (error.number(), error.to_string().as_str()),
-        (0x6000_02FF, "the device refuses setting the bit rate: error 255, manufacturer's code 7")
-    );
+    let words = "the device refuses setting the bit rate: error 255, manufacturer's code 7";
+    assert_eq!((error.number(), error.to_string().as_str()), (0x6000_02FF, words));
     let mut wrong = bus([Slave::new(ADDRESS, 5)]);
     assert!(Master::new(&mut wrong, ANSWER).select(&other).is_err());
     assert!(!wrong.slaves[0].configured);

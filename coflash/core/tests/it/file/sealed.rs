@@ -177,8 +177,7 @@ fn every_field_is_where_the_format_says() {
 /// FIPS 180-4 by NIST's example file "SHA512_256.pdf": "abc".
 #[test]
 fn the_hash_is_sha_512_256() {
-    let digits: String = hash(b"abc").iter().map(|byte| format!("{byte:02x}")).collect();
-    assert_eq!(digits, "53048e2681941ef99b2e29b76b4c7dabe4c2d0c634fc6d46e0e2f13107e7af23");
+    assert_eq!(digits(&hash(b"abc")), "53048e2681941ef99b2e29b76b4c7dabe4c2d0c634fc6d46e0e2f13107e7af23");
 }
 
 #[test]
@@ -236,24 +235,15 @@ fn the_device_tells_which_rule_is_broken() {
     let file = sealer.seal(&image(1000), &release()).unwrap();
     assert!(verify(&file, &good).is_ok());
     let id = release().public().id();
+    let vendor = Refusal::Vendor { image: VENDOR, device: 1 };
+    let product = Refusal::Product { image: PRODUCT, device: 1 };
+    let hardware = Refusal::Hardware { mask: 1, device: 33 };
     let cases = [
-        (
-            Device { vendor_id: Some(1), ..good },
-            Refusal::Vendor { image: VENDOR, device: 1 },
-            Fault::WrongVendor,
-        ),
-        (
-            Device { product_code: Some(1), ..good },
-            Refusal::Product { image: PRODUCT, device: 1 },
-            Fault::WrongProduct,
-        ),
+        (Device { vendor_id: Some(1), ..good }, vendor, Fault::WrongVendor),
+        (Device { product_code: Some(1), ..good }, product, Fault::WrongProduct),
         (Device { program: Some(2), ..good }, Refusal::Program { image: 1, device: 2 }, Fault::WrongProduct),
         (Device { unique_id: Some([8; 12]), ..good }, Refusal::UniqueId, Fault::WrongProduct),
-        (
-            Device { revision: Some(33), ..good },
-            Refusal::Hardware { mask: 1, device: 33 },
-            Fault::WrongProduct,
-        ),
+        (Device { revision: Some(33), ..good }, hardware, Fault::WrongProduct),
         (Device { room: Some(999), ..good }, Refusal::TooLarge { image: 1000, device: 999 }, Fault::Address),
         (Device { counter: 8, ..good }, Refusal::Counter { image: 7, device: 8 }, Fault::Rollback),
         (Device { epoch: 4, ..good }, Refusal::Epoch { image: 3, device: 4 }, Fault::Rollback),
@@ -297,10 +287,8 @@ fn the_device_tells_which_rule_is_broken() {
         wrong[at] ^= 1;
         assert_eq!(refusal(&wrong, &good), expected);
     }
-    assert_eq!(
-        refusal(&file[..last], &good),
-        Refusal::CutOff { needed: last as u64 + 1, found: last as u64 }
-    );
+    let cut_off = Refusal::CutOff { needed: last as u64 + 1, found: last as u64 };
+    assert_eq!(refusal(&file[..last], &good), cut_off);
     let longer = [&file[..], &[0]].concat();
     assert_eq!(refusal(&longer, &good), Refusal::TooLong { needed: last as u64 + 1, found: last as u64 + 2 });
     assert_eq!(refusal(b"S0", &good), Refusal::NotSealed);
@@ -414,11 +402,9 @@ fn a_certificate_holds_for_what_it_says_and_only_if_the_root_has_signed_it() {
     let rule = Refusal::Certificate;
     assert_eq!(of(Certificate { vendor_id: 1, ..certified() }), rule("it is for another vendor"));
     assert_eq!(of(Certificate { product_code: 1, ..certified() }), rule("it is for another product"));
-    assert_eq!(
-        of(Certificate { highest: 6, ..certified() }),
-        rule("it does not allow this security counter")
-    );
-    assert_eq!(of(Certificate { lowest: 8, ..certified() }), rule("it does not allow this security counter"));
+    let counter = rule("it does not allow this security counter");
+    assert_eq!(of(Certificate { highest: 6, ..certified() }), counter);
+    assert_eq!(of(Certificate { lowest: 8, ..certified() }), counter);
     assert_eq!(of(Certificate { role: Role::Test, ..certified() }), Refusal::Test);
     assert_eq!(of(Certificate { epoch: 1, ..certified() }), Refusal::Epoch { image: 1, device: 2 });
     let other = key(9).public();
@@ -457,17 +443,12 @@ fn what_no_device_would_take_is_not_sealed() {
     assert_eq!(sealed(Sealer { encrypt_for: &twice, ..sealer() }), SealFault::Twice(kek(1).id()));
     let text = "x".repeat(845);
     assert_eq!(sealed(Sealer { text: Some(&text), ..sealer() }), SealFault::Manifest(176 + 4 + 848));
+    let product = Certificate { product_code: 1, ..certified() }.signed_by(&root());
     for (sealer, what) in [
         (Sealer { vendor_id: 1, ..sealer() }, "the vendor-ID"),
         (Sealer { counter: 4, ..sealer() }, "security counters"),
         (Sealer { counter: 10, ..sealer() }, "security counters"),
-        (
-            Sealer {
-                certificate: Some(Certificate { product_code: 1, ..certified() }.signed_by(&root())),
-                ..sealer()
-            },
-            "the product code",
-        ),
+        (Sealer { certificate: Some(product), ..sealer() }, "the product code"),
     ] {
         assert!(matches!(sealed(sealer), SealFault::NotAllowed { what: found, .. } if found == what));
     }

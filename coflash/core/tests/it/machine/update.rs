@@ -90,10 +90,8 @@ fn each_node_is_matched_and_a_foreign_one_is_left_alone() {
     has.crc_of_application = Some(CRC);
     let mut bus = Bus(vec![device(5, 1234), has, device(7, 77), device(9, 99), device(20, 5)]);
     let plan = planned(&mut bus, &package);
-    assert_eq!(
-        steps(&plan),
-        [(5, "drive", "update"), (6, "drive", "has"), (7, "valve", "update"), (9, "panel", "update")]
-    );
+    let due = [(5, "drive", "update"), (6, "drive", "has"), (7, "valve", "update"), (9, "panel", "update")];
+    assert_eq!(steps(&plan), due);
     assert_eq!(plan.foreign.iter().map(|foreign| foreign.node.get()).collect::<Vec<_>>(), [20]);
     let missing: Vec<_> = plan.missing.iter().map(|missing| missing.fault.clone()).collect();
     assert_eq!(
@@ -230,9 +228,7 @@ fn the_order_is_that_of_the_package() {
     let plan = planned(&mut bus, &package);
     // The fake's application reports what it is told to.
     assert_eq!(plan.updates(), 3);
-    for fake in &mut bus.0 {
-        fake.crc_of_application = None;
-    }
+    bus.0.iter_mut().for_each(|fake| fake.crc_of_application = None);
     assert_eq!(planned(&mut bus, &package).updates(), 0);
 }
 
@@ -374,12 +370,8 @@ fn a_bootloader_without_an_identity_of_its_own_is_no_other_device() {
         [([0; 4], format!("{nodes}, \"trial_run\": false")), ([63, 0, 0, 0], nodes.to_owned())]
     {
         let package = package(&[("drive", &entry)]);
-        for (in_plan, in_run) in [
-            (APPLICATION, APPLICATION),
-            (APPLICATION, BOOTLOADER),
-            (BOOTLOADER, BOOTLOADER),
-            (BOOTLOADER, APPLICATION),
-        ] {
+        let (a, b) = (APPLICATION, BOOTLOADER);
+        for (in_plan, in_run) in [(a, a), (a, b), (b, b), (b, a)] {
             let mut bus = Bus(vec![device(5, 1234)]);
             let application = Plate([63, 1234, 2, 1005]);
             bus.0[0].maker = Some(Box::new(Sparse { bootloader: Plate(bootloader), application }));
@@ -425,9 +417,7 @@ fn no_plan_is_made_while_another_tool_talks_to_a_node() {
     // Nothing but a heartbeat: a plan.
     bus.0[0].inject(Frame::of(CobId::new(0x705).unwrap(), &[5]));
     assert_eq!(plan(&mut bus, &package, &alone, &Arc::default()).unwrap().updates(), 2);
-    for fake in &mut bus.0 {
-        fake.log.clear();
-    }
+    bus.0.iter_mut().for_each(|fake| fake.log.clear());
     bus.0[1].inject(request_to(77));
     let error = plan(&mut bus, &package, &alone, &Arc::default()).unwrap_err();
     let PlanError::Bus(error @ Error::NotAlone { .. }) = error else { panic!("{error}") };
@@ -484,9 +474,7 @@ fn a_device_that_is_gone_costs_the_others_nothing() {
 fn an_interrupted_run_is_continued_by_the_next() {
     let package = package(&[("panel", r#""nodes": [9]"#), ("drive", DRIVES)]);
     let mut bus = Bus(vec![device(5, 1234), device(6, 1234), device(9, 1)]);
-    for fake in &mut bus.0 {
-        fake.crc_of_application = None;
-    }
+    bus.0.iter_mut().for_each(|fake| fake.crc_of_application = None);
     let plan = planned(&mut bus, &package);
     let flag: Arc<AtomicBool> = Arc::default();
     let options = RunOptions::default().many(ManyOptions::default().cancelled(flag.clone()));
@@ -497,9 +485,8 @@ fn an_interrupted_run_is_continued_by_the_next() {
     let outcomes = run(&mut interrupted, &package, &plan, &options, &|_, _, _| {});
     let mut bus = interrupted.of;
     assert_eq!(outcomes.len(), 3);
-    for (outcome, state) in
-        outcomes.iter().zip([DeviceState::Erased, DeviceState::Untouched, DeviceState::Untouched])
-    {
+    let states = [DeviceState::Erased, DeviceState::Untouched, DeviceState::Untouched];
+    for (outcome, state) in outcomes.iter().zip(states) {
         let Err(Bad::Failed(failed)) = &outcome.result else { panic!("{:?}", words(&outcomes)) };
         assert!(matches!(failed.error, Error::Cancelled), "{failed:?}");
         assert_eq!(failed.left.state, state);

@@ -1,7 +1,7 @@
 //! Refusals before the device is changed, in every dialect: files that cannot be a program, and
 //! programs for another device or for another place in flash.
 
-use super::update;
+use super::{left, update};
 use canopen::NodeId;
 use coflash_core::device::info::info;
 use coflash_core::device::{Dialect, Doing, Error, Session, Timing};
@@ -46,11 +46,7 @@ fn refused(fake: &mut Fake, file: &Program, options: FlashOptions) -> Error {
     let (result, events) = run(fake, file, options);
     let error = result.unwrap_err();
     assert_eq!(fake.writes(), [] as [&str; 0], "{error}");
-    assert_eq!(
-        events.last().and_then(Event::left).map(|left| left.state),
-        Some(DeviceState::Untouched),
-        "{error}"
-    );
+    assert_eq!(left(&events), DeviceState::Untouched, "{error}");
     error
 }
 
@@ -60,14 +56,10 @@ fn speaks(dialect: Dialect) -> FlashOptions {
 
 #[test]
 fn another_devices_label_is_refused_in_every_dialect() {
+    let product = "the program is for product code 000004D3h, and node 5 has 000004D2h";
     for (vendor_id, product_code, number, words) in [
-        (
-            VENDOR,
-            PRODUCT + 1,
-            0x6000_0182,
-            "the program is for product code 000004D3h, and node 5 has 000004D2h",
-        ),
-        (0, PRODUCT + 1, 0x6000_0182, "the program is for product code 000004D3h, and node 5 has 000004D2h"),
+        (VENDOR, PRODUCT + 1, 0x6000_0182, product),
+        (0, PRODUCT + 1, 0x6000_0182, product),
         (0x40, PRODUCT, 0x6000_0180, "the program is for vendor-ID 00000040h, and node 5 has 0000003Fh"),
     ] {
         for dialect in Dialect::ALL {
@@ -91,19 +83,11 @@ fn another_devices_label_is_refused_in_every_dialect() {
 fn a_label_that_fits_goes_in_and_is_in_block_0() {
     for (vendor_id, product_code) in [(VENDOR, PRODUCT), (0, 0), (0, PRODUCT)] {
         let mut fake = Fake::new(APPLICATION);
-        run(
-            &mut fake,
-            &file(&labelled(vendor_id, product_code), START, Told::default()),
-            FlashOptions::default(),
-        )
-        .0
-        .unwrap();
+        let file = file(&labelled(vendor_id, product_code), START, Told::default());
+        run(&mut fake, &file, FlashOptions::default()).0.unwrap();
         // Block 0: 24 bytes of data (manual, table 6): size, vendor-ID, product code, version, date.
-        let words: Vec<u32> = fake.blocks[0][12..36]
-            .chunks(4)
-            .map(|word| u32::from_le_bytes(word.try_into().unwrap()))
-            .collect();
-        assert_eq!(words, [1024, vendor_id, product_code, 7, 0, 0]);
+        let words = [1024, vendor_id, product_code, 7, 0, 0].map(u32::to_le_bytes).concat();
+        assert_eq!(fake.blocks[0][12..36], words);
     }
     // A device that does not report its product code may be any product.
     struct Reticent;
@@ -275,9 +259,8 @@ fn what_is_for_another_place_than_the_devices_is_refused() {
         assert_eq!((error.number(), error.to_string().as_str()), (0x6000_0021, words), "{dialect:?}");
     }
     run(&mut at(START, 1024, APPLICATION, &BOTH), &file, FlashOptions::default()).0.unwrap();
-    run(&mut at(START + 0x1_0000, 1024, APPLICATION, &BOTH), &file, FlashOptions::default().force(true))
-        .0
-        .unwrap();
+    let force = FlashOptions::default().force(true);
+    run(&mut at(START + 0x1_0000, 1024, APPLICATION, &BOTH), &file, force).0.unwrap();
 }
 
 /// A checksum at the end of the region, as srec_cat puts it there: the last sector of the last
@@ -323,12 +306,11 @@ fn the_bootloader_is_asked_where_the_application_does_not_know() {
     assert_eq!(result.unwrap_err().number(), 0x6000_0015);
     // The application was called back in vain: it starts again.
     assert_eq!(fake.writes(), ["command 80", "command 01"]);
-    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
+    assert_eq!(left(&events), DeviceState::Untouched);
     // What is no place in the flash of such a device is something else of another maker.
     for (base, size) in [(0x2000_0000, 0x1_0000), (START + 0x1_0000, 0), (START + 0x1_0000, u32::MAX)] {
-        run(&mut at(base, size, APPLICATION, &[APPLICATION, BOOTLOADER]), &file, FlashOptions::default())
-            .0
-            .unwrap();
+        let mut fake = at(base, size, APPLICATION, &[APPLICATION, BOOTLOADER]);
+        run(&mut fake, &file, FlashOptions::default()).0.unwrap();
     }
 }
 
@@ -387,7 +369,7 @@ fn a_sealed_device_gets_sealed_images_only() {
     let (result, events) = run(&mut fake, &file, FlashOptions::default());
     assert_eq!(result.unwrap_err().to_string(), words);
     assert_eq!(fake.writes(), ["command 80", "command 01"]);
-    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
+    assert_eq!(left(&events), DeviceState::Untouched);
 }
 
 /// An image without addresses is checked against its target region.

@@ -11,7 +11,7 @@ use coflash_core::update::event::Phase;
 use coflash_core::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
 
-use super::{file, update};
+use super::{file, script, update};
 use crate::tap::Tap;
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
@@ -34,9 +34,7 @@ fn left(running: u32, change: &dyn Fn(&mut Fake), options: FlashOptions) -> Devi
 }
 
 fn on_command(command: u8, outcome: Outcome) -> impl Fn(&mut Fake) {
-    move |fake| {
-        fake.on_command = Box::new(move |came| if came == command { outcome } else { Outcome::Accept });
-    }
+    move |fake| fake.on_command = script(command, usize::MAX, outcome)
 }
 
 fn dialect(dialect: Dialect) -> FlashOptions {
@@ -71,8 +69,7 @@ fn a_call_that_fails_has_changed_nothing() {
 fn a_refusal_before_the_erasure_leaves_the_old_program() {
     for kind in STANDARD {
         for outcome in [Outcome::Abort(0x0800_0022), Outcome::AbortStatus(0x0800_0020, 0x84)] {
-            let options = dialect(kind);
-            let there = left(BOOTLOADER, &on_command(CLEAR, outcome), options);
+            let there = left(BOOTLOADER, &on_command(CLEAR, outcome), dialect(kind));
             assert_eq!(there.state, DeviceState::Untouched, "{kind}, {outcome:?}");
             let words = there.to_string();
             assert!(words.starts_with("its bootloader is running; it was not changed"), "{words}");
@@ -109,11 +106,8 @@ fn what_the_device_still_has_is_told() {
         };
         let there = left(BOOTLOADER, &refuses(Some(0x0BAD_CAFE)), dialect(kind));
         assert_eq!(there.state, DeviceState::Untouched, "{kind}");
-        assert_eq!(
-            there.to_string(),
-            "its bootloader is running; it was not changed (CRC 0BADCAFEh)",
-            "{kind}"
-        );
+        let words = "its bootloader is running; it was not changed (CRC 0BADCAFEh)";
+        assert_eq!(there.to_string(), words, "{kind}");
         let gone = left(BOOTLOADER, &refuses(None), dialect(kind));
         assert_eq!(gone.state, DeviceState::Erased, "{kind}");
         assert_eq!(gone.to_string(), "its bootloader is running; it contains no complete program");
@@ -183,9 +177,8 @@ fn without_an_answer_a_postponed_erase_is_not_called_done() {
         }
         let mut states = Vec::new();
         for frames in begin..command(1).unwrap_or(whole.sent.len()) {
-            states.push(
-                left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = frames).0, dialect(kind)).state,
-            );
+            let cut = |fake: &mut Fake| (postpones(fake), fake.frames_left = frames).0;
+            states.push(left(BOOTLOADER, &cut, dialect(kind)).state);
             let slow = left(BOOTLOADER, &|fake| fake.frames_left = begin, dialect(kind));
             assert_eq!(slow.state, DeviceState::Erased, "{kind}");
         }
@@ -231,15 +224,8 @@ fn a_begun_download_without_data_may_have_left_the_old_program() {
         assert!(events.contains(&Phase::GoingOn { done: 0, total: 4001 }.into()), "{events:?}");
         let data = |frame: &Frame| frame.exactly::<8>().is_some_and(|data| data[1..4] == [0x50, 0x1F, 1]);
         let frames = whole.sent.iter().position(data).unwrap() + 1;
-        let cut = left(
-            BOOTLOADER,
-            &|fake| {
-                begun(fake);
-                fake.frames_left = frames;
-            },
-            FlashOptions::default(),
-        );
-        assert_eq!(cut.state, state, "{crc:08X}");
+        let cut = |fake: &mut Fake| (begun(fake), fake.frames_left = frames).0;
+        assert_eq!(left(BOOTLOADER, &cut, FlashOptions::default()).state, state, "{crc:08X}");
     }
 }
 
@@ -289,10 +275,8 @@ fn somebody_elses_requests_end_an_update_before_anything_is_done() {
         let error = result.unwrap_err();
         assert!(matches!(error, Error::NotAlone { who: Intruder::Requests(Some(_)), .. }), "{error}");
         assert_eq!(error.number(), 0x6000_0012);
-        assert_eq!(
-            error.to_string(),
-            "another tool is using node 5: it sends SDO requests, the last one for 1F57h/1"
-        );
+        let words = "another tool is using node 5: it sends SDO requests, the last one for 1F57h/1";
+        assert_eq!(error.to_string(), words);
         assert!(fake.writes().is_empty(), "{:?}", fake.log);
         assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
 

@@ -288,22 +288,14 @@ fn esacademy_says_what_went_wrong_by_the_error_register_alone() {
 /// application runs again.
 #[test]
 fn a_password_of_another_form_stops_no_application() {
-    for (running, dialect) in [
-        (BOOT, None),
-        (APPLICATION, None),
-        (BOOT, Some(Dialect::EsAcademy)),
-        (APPLICATION, Some(Dialect::EsAcademy)),
-    ] {
+    let all = [None, Some(Dialect::EsAcademy)];
+    for (running, dialect) in all.into_iter().flat_map(|dialect| [(BOOT, dialect), (APPLICATION, dialect)]) {
         let (mut fake, _) = EsAcademy::fake(|_| {});
         fake.running = Some(running);
         let (result, ..) = run_at(&mut fake, 64, &locked("no number").dialect(dialect));
         assert!(matches!(result, Err(Error::NotInDialect { .. })), "{result:?}");
-        assert_eq!(
-            (fake.running, fake.sent.is_empty()),
-            (Some(running), dialect.is_some()),
-            "{:?}",
-            fake.log
-        );
+        let end = (fake.running, fake.sent.is_empty());
+        assert_eq!(end, (Some(running), dialect.is_some()), "{:?}", fake.log);
         assert_eq!(fake.count("64: 7F50/1, 4 bytes"), 0);
     }
     // A lift without a password, also where it is only read.

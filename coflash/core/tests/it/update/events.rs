@@ -83,17 +83,28 @@ fn an_update_that_fails_tells_retries_and_ends_with_done_too() {
     assert!(!done["error"]["advice"].as_str().unwrap().is_empty());
 }
 
-/// Every kind of event, with the names on which a program may rely.
+/// The event has this form, and its line the node and the text, too; the names are those on which a
+/// program may rely.
+#[track_caller]
+fn has_form(kind: &str, name: &str, event: &Event, data: &Value) {
+    let mut form = json!({ "event": kind });
+    if !name.is_empty() {
+        form[kind] = name.into();
+    }
+    form.as_object_mut().unwrap().extend(data.as_object().unwrap().clone());
+    assert_eq!(json!(event), form, "{event}");
+    form["node"] = NODE.into();
+    form["text"] = event.to_string().into();
+    assert_eq!(json!(event.line(node())), form, "{event}");
+}
+
+const TOOK: Duration = Duration::from_micros(1_234_567);
+
 #[test]
-fn the_names_stay() {
-    let of = |number| NodeId::new(number).unwrap();
-    let seconds = Duration::from_micros(1_234_567);
+fn the_names_of_the_course_stay() {
     let application = DeviceType(0x0002_0192);
     let program = || json!({ "device_type": 131_474, "bootloader": false });
     let renewing = Phase::Renewing { number: 2, from: 1, to: 65_536 };
-    let target = Target { vendor_id: 63, product_code: 2 };
-    let silence = Silence { doing: Doing::Restart, silent: seconds, limit: seconds };
-    let doing = "restarting the program";
     let plain = [
         ("found", Event::Found(application), program()),
         ("progress", Event::Progress { done: 3, total: 9 }, json!({ "done": 3, "total": 9 })),
@@ -113,7 +124,7 @@ fn the_names_stay() {
         ("calling_back", Phase::CallingBack, json!({})),
         ("in_bootloader", Phase::InBootloader, json!({})),
         ("erasing", Phase::Erasing, json!({})),
-        ("erased", Phase::Erased { took: seconds }, json!({ "seconds": 1.235 })),
+        ("erased", Phase::Erased { took: TOOK }, json!({ "seconds": 1.235 })),
         ("verified", Phase::Verified { crc: 7 }, json!({ "crc": 7 })),
         ("trial_starting", Phase::TrialStarting, json!({})),
         ("trial_passed", Phase::TrialPassed(application), program()),
@@ -126,6 +137,17 @@ fn the_names_stay() {
         ("started", Phase::Started(application), program()),
         ("verified_again", Phase::VerifiedAgain { crc: 7 }, json!({ "crc": 7 })),
     ];
+    plain.iter().for_each(|(kind, event, data)| has_form(kind, "", event, data));
+    phases.into_iter().for_each(|(name, phase, data)| has_form("phase", name, &phase.into(), &data));
+}
+
+#[test]
+fn the_names_of_the_notes_and_warnings_stay() {
+    let of = |number| NodeId::new(number).unwrap();
+    let target = Target { vendor_id: 63, product_code: 2 };
+    let silence = Silence { doing: Doing::Restart, silent: TOOK, limit: TOOK };
+    let silent = json!({ "doing": "restarting the program", "seconds": 1.235, "limit_seconds": 1.235 });
+    let losses = Losses { refused: 9, lost: 2, restarts: 1 };
     let notes = [
         ("target_right", Note::TargetRight(target), json!({ "vendor_id": 63, "product_code": 2 })),
         ("dialect", Note::Dialect { dialect: Dialect::EsAcademy }, json!({ "dialect": "esacademy" })),
@@ -139,32 +161,11 @@ fn the_names_stay() {
         ("master_kept", Warning::MasterKept { node: of(3) }, json!({ "master": 3 })),
         ("master_missing", Warning::MasterMissing, json!({})),
         ("covers_staging", Warning::CoversStaging { first: 0x080E_0000 }, json!({ "first": "0x080e0000" })),
-        (
-            "silent",
-            Warning::Silent(silence),
-            json!({ "doing": doing, "seconds": 1.235, "limit_seconds": 1.235 }),
-        ),
-        (
-            "adapter",
-            Warning::Adapter(Losses { refused: 9, lost: 2, restarts: 1 }),
-            json!({ "refused": 9, "lost": 2, "restarts": 1 }),
-        ),
+        ("silent", Warning::Silent(silence), silent),
+        ("adapter", Warning::Adapter(losses), json!({ "refused": 9, "lost": 2, "restarts": 1 })),
     ];
-    let plain = plain.into_iter().map(|(kind, event, data)| (kind, "", event, data));
-    let phases = phases.into_iter().map(|(name, it, data)| ("phase", name, Event::from(it), data));
-    let notes = notes.into_iter().map(|(name, it, data)| ("note", name, Event::from(it), data));
-    let warnings = warnings.into_iter().map(|(name, it, data)| ("warning", name, Event::from(it), data));
-    for (kind, name, event, data) in plain.chain(phases).chain(notes).chain(warnings) {
-        let mut form = json!({ "event": kind });
-        if !name.is_empty() {
-            form[kind] = name.into();
-        }
-        form.as_object_mut().unwrap().extend(data.as_object().unwrap().clone());
-        assert_eq!(json!(event), form, "{event}");
-        form["node"] = 9.into();
-        form["text"] = event.to_string().into();
-        assert_eq!(json!(event.line(of(9))), form, "{event}");
-    }
+    notes.into_iter().for_each(|(name, note, data)| has_form("note", name, &note.into(), &data));
+    warnings.into_iter().for_each(|(name, warning, data)| has_form("warning", name, &warning.into(), &data));
 }
 
 #[test]

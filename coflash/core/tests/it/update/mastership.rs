@@ -5,8 +5,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coboot_can::Adapter;
-use coboot_can::AdapterError;
+use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::Dialect;
 use coflash_core::file::block_file;
 use coflash_core::update::event::{Note, Warning};
@@ -213,9 +212,8 @@ fn what_a_lift_tells_of_itself_is_shown_before_anything_is_done_to_it() {
          10000003h, serial number 10000004h"
     );
     // Only the question for the active master was sent, and there is none.
-    let protocol: Vec<u16> = fake.sent.iter().filter_map(|frame| frame.cob_id()).map(|id| id.get()).collect();
-    let protocol: Vec<u16> = protocol.into_iter().filter(|id| (0x71..=0x76).contains(id)).collect();
-    assert_eq!(protocol, [0x73]);
+    let sent = fake.sent.iter().filter_map(|frame| frame.cob_id()).map(|id| id.get());
+    assert_eq!(sent.filter(|id| (0x71..=0x76).contains(id)).collect::<Vec<_>>(), [0x73]);
 }
 
 /// A node 126 without SDO that sends a heartbeat every second is another device in its bootloader.

@@ -20,7 +20,7 @@ use coflash_core::file::block_file;
 use coflash_core::file::Program;
 use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Report};
 use coflash_core::Error;
-use kit::fake::NODE;
+use kit::fake::{Outcome, NODE};
 
 pub fn node() -> NodeId {
     NodeId::new(NODE).unwrap()
@@ -49,4 +49,20 @@ pub fn left(events: &[Event]) -> DeviceState {
         Some(Event::Done(done)) => done.left.state,
         other => panic!("{other:?}"),
     }
+}
+
+/// For the first `times` times of `number` this result, then normal.
+pub fn script<T: PartialEq + Copy + Send + 'static>(
+    number: T,
+    times: usize,
+    outcome: Outcome,
+) -> Box<dyn FnMut(T) -> Outcome + Send> {
+    let mut left = times;
+    Box::new(move |came| {
+        if came == number && left > 0 {
+            left -= 1;
+            return outcome;
+        }
+        Outcome::Accept
+    })
 }

@@ -76,10 +76,8 @@ fn a_program_that_ran_runs_again() {
         assert_eq!(result.is_ok(), matches!(trial, Trial::Works));
         assert_eq!(fake.writes().iter().filter(|entry| *entry == &"command 01").count(), 1);
         assert_eq!(fake.running, Some(APPLICATION));
-        assert_eq!(
-            events.iter().any(|event| matches!(event, Event::Phase(Phase::Started(_)))),
-            result.is_ok()
-        );
+        let started = events.iter().any(|event| matches!(event, Event::Phase(Phase::Started(_))));
+        assert_eq!(started, result.is_ok());
     }
 }
 
@@ -156,14 +154,12 @@ fn a_refusal_says_what_to_do() {
         assert!(error.advice().to_string().contains(advice), "{status:X}: {}", error.advice());
         assert_eq!(written(&log), &WHOLE[..2], "{status:X}");
     }
-    // Busy may pass.
-    let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((NOT_NOW, 0x86)));
-    assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
-    assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"]);
-    // A transfer that broke off (05040000h: time-out) leaves data that are not in the expected form.
-    let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((0x0504_0000, 0x04)));
-    assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
-    assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"]);
+    // Busy may pass. A transfer that broke off (05040000h: time-out) leaves data of another form.
+    for refusal in [(NOT_NOW, 0x86), (0x0504_0000, 0x04)] {
+        let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some(refusal));
+        assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
+        assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"], "{refusal:X?}");
+    }
 }
 
 #[test]
@@ -264,16 +260,12 @@ fn a_bootloader_without_renewal_is_given_up() {
 /// The bootloader is no program in `info`, and has a line of its own.
 #[test]
 fn info_shows_the_bootloader_and_its_renewal() {
+    let late = "; another one waits for its trial; the last one on trial was not confirmed in time";
     for (state, origin, end, words) in [
         (NONE, HOME, [0, 0], ""),
         (STAGED, HOME, [0, 0], "; another one waits for its trial"),
         (STAGED, TRIAL, [0, 0], "; it is on trial: coflash flash with its file confirms it"),
-        (
-            STAGED,
-            HOME,
-            [1, 0],
-            "; another one waits for its trial; the last one on trial was not confirmed in time",
-        ),
+        (STAGED, HOME, [1, 0], late),
         (CONFIRMED, 2, [0, 0], "; it is confirmed, and not installed yet"),
         (INSTALLED, TRIAL, [0, 0], "; a spare of it is in the flash of the last program"),
         (INSTALLED, HOME, [0, 0], "; a spare of it is in the flash of the last program"),

@@ -6,14 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coboot_can::Adapter;
-use coboot_can::AdapterError;
+use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::error::{Error, IdentityPart};
 use coflash_core::device::{Session, Timing};
 use coflash_core::update::event::Phase;
 use coflash_core::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 
-use super::{file, node, update};
+use super::{file, node, script, update};
 use crate::tap::Tap;
 use kit::fake::{Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
@@ -21,11 +20,13 @@ fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Err
     update(adapter, file(), options)
 }
 
-/// A device that is switched on at this time, with a program that starts 300 ms later unless a
-/// client sends a request.
-fn late(fake: Fake, on: Duration) -> Tap<'static, Fake> {
+/// A device that is switched on after this time, with a program that starts 300 ms later unless a
+/// client sends a request; and when that is.
+fn late(millis: u64) -> (Tap<'static, Fake>, Duration) {
+    let fake = Fake::new(BOOTLOADER);
+    let on = fake.now + Duration::from_millis(millis);
     let mut asked = false;
-    Tap::sending(fake, move |fake, frame| {
+    let late = Tap::sending(fake, move |fake, frame| {
         assert!(fake.now < on + Duration::from_secs(60), "it was not caught");
         let until = on + Duration::from_millis(300);
         asked |= (on..until).contains(&fake.now) && frame.cob_id().unwrap().get() == 0x605;
@@ -34,36 +35,30 @@ fn late(fake: Fake, on: Duration) -> Tap<'static, Fake> {
             () if asked || fake.now < until => Some(BOOTLOADER),
             () => Some(0xDEAD),
         };
-    })
+    });
+    (late, on)
 }
 
 #[test]
 fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_window() {
     for millis in [0, 50, 999, 60_000, 60_037] {
-        let fake = Fake::new(BOOTLOADER);
-        let on = fake.now + Duration::from_millis(millis);
-        let mut late = late(fake, on);
         let options = FlashOptions::default().wait(true).start(false);
-        let (result, events) = run(&mut late, &options);
+        let (result, events) = run(&mut late(millis).0, &options);
         assert!(result.is_ok(), "{millis}: {result:?}");
         // It is reported once, however long it takes.
         let searching =
             events.iter().filter(|event| matches!(event, Event::Phase(Phase::Searching { .. }))).count();
         assert_eq!(searching, usize::from(millis > 0), "{events:?}");
     }
-    let fake = Fake::new(BOOTLOADER);
-    let on = fake.now + Duration::from_secs(60);
-    let mut late = late(fake, on);
-    assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
+    let (result, _) = run(&mut late(60_000).0, &FlashOptions::default());
+    assert!(matches!(result, Err(Error::NoAnswer { .. })), "{result:?}");
 }
 
 /// The same as a separate command: the device stays in its bootloader, and is not changed.
 #[test]
 fn a_device_that_is_switched_on_is_caught() {
     for (millis, within) in [(0, None), (50, None), (60_037, None), (59_000, Some(Duration::from_secs(60)))] {
-        let fake = Fake::new(BOOTLOADER);
-        let on = fake.now + Duration::from_millis(millis);
-        let mut late = late(fake, on);
+        let (mut late, on) = late(millis);
         let mut session = Session::new(&mut late, node(), Timing::default());
         let mut events = Vec::new();
         let options = CatchOptions::default().within(within);
@@ -78,9 +73,8 @@ fn a_device_that_is_switched_on_is_caught() {
         // Requests that were given up are aborted.
         assert!(late.of.writes().iter().all(|entry| entry.starts_with("abort ")), "{:?}", late.of.log);
     }
-    let fake = Fake::new(BOOTLOADER);
-    let (from, on) = (fake.now, fake.now + Duration::from_secs(59));
-    let mut late = late(fake, on);
+    let mut late = late(59_000).0;
+    let from = late.of.now;
     let mut session = Session::new(&mut late, node(), Timing::default());
     let options = CatchOptions::default().within(Some(Duration::from_secs(30)));
     assert!(matches!(catch(&mut session, &options, &mut |_| {}), Err(Error::NoAnswer { .. })));
@@ -92,15 +86,7 @@ fn a_device_that_is_switched_on_is_caught() {
 fn an_application_that_answers_is_called_back_until_it_goes() {
     let caught = |outcome, times, within| {
         let mut fake = Fake::new(APPLICATION);
-        let mut calls = 0;
-        fake.on_command = Box::new(move |_| {
-            calls += 1;
-            if calls <= times {
-                outcome
-            } else {
-                Outcome::Accept
-            }
-        });
+        fake.on_command = script(0x80, times, outcome);
         let mut session = Session::new(&mut fake, node(), Timing::default());
         let caught = catch(&mut session, &CatchOptions::default().within(within), &mut |_| {});
         (caught, fake.writes().len())
@@ -191,15 +177,7 @@ fn whoever_comes_up_is_caught_under_whatever_node_id() {
 fn an_application_that_stays_is_asked_until_it_goes() {
     let stubborn = |refusal: Outcome| {
         let mut fake = Fake::new(APPLICATION);
-        let mut calls = 0;
-        fake.on_command = Box::new(move |command| {
-            calls += u32::from(command == 0x80);
-            if command == 0x80 && calls < 6 {
-                refusal
-            } else {
-                Outcome::Accept
-            }
-        });
+        fake.on_command = script(0x80, 5, refusal);
         fake
     };
     for refusal in [Outcome::Abort(0x0800_0022), Outcome::Ignore] {
@@ -232,16 +210,18 @@ fn the_user_gives_up() {
     }
 }
 
-/// 1018h of the program on trial; the bootloader has vendor-ID 3Fh, product code 1234, no serial
-/// number.
-struct Told(fn(u8) -> Option<Result<u32, u32>>, Option<u32>);
+/// A sub-index of 1018h of the program on trial that has its own value or abort code, and the serial number
+/// of the bootloader, which has vendor-ID 3Fh and product code 1234.
+struct Told(Option<(u8, Result<u32, u32>)>, Option<u32>);
 
 impl Maker for Told {
     fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
         let number = |number: u32| number.to_le_bytes().to_vec();
         match at {
             (0x1018, 4) if running == BOOTLOADER => Some(self.1.map(number).ok_or(0x0609_0011)),
-            (0x1018, sub) if running == APPLICATION => self.0(sub).map(|value| value.map(number)),
+            (0x1018, sub) if running == APPLICATION => {
+                self.0.filter(|(own, _)| *own == sub).map(|(_, value)| value.map(number))
+            }
             _ => None,
         }
     }
@@ -260,51 +240,34 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
     };
     // The identity of the test's device; no serial number on one side; another revision; a product
     // code of 0.
-    let same: fn(u8) -> Option<Result<u32, u32>> = |_| None;
     for reported in [
-        Told(same, None),
-        Told(same, Some(7)),
-        Told(|sub| (sub == 4).then_some(Ok(9)), None),
-        Told(|sub| (sub == 4).then_some(Ok(0)), Some(7)),
-        Told(|sub| (sub == 4).then_some(Ok(7)), Some(7)),
-        Told(|sub| (sub == 3).then_some(Ok(0x0002_0001)), None),
-        Told(|sub| (sub == 2).then_some(Ok(0)), None),
+        Told(None, None),
+        Told(None, Some(7)),
+        Told(Some((4, Ok(9))), None),
+        Told(Some((4, Ok(0))), Some(7)),
+        Told(Some((4, Ok(7))), Some(7)),
+        Told(Some((3, Ok(0x0002_0001))), None),
+        Told(Some((2, Ok(0))), None),
     ] {
         let (result, commands, _) = fake(reported, &trial);
         assert!(result.is_ok(), "{result:?}");
         assert_eq!(commands[commands.len() - 2..], ["command 83", "command 01"]);
     }
-    let cases: [(Told, IdentityPart, &str); 4] = [
-        (
-            Told(|sub| (sub == 1).then_some(Ok(0x40)), None),
-            IdentityPart::VendorId,
-            "the program on trial tells vendor-ID 00000040h, and the bootloader of node 5 0000003Fh",
-        ),
-        (
-            Told(|sub| (sub == 1).then_some(Err(0x0602_0000)), None),
-            IdentityPart::VendorId,
-            "the program on trial tells vendor-ID none, and the bootloader of node 5 0000003Fh",
-        ),
-        (
-            Told(|sub| (sub == 2).then_some(Ok(1235)), None),
-            IdentityPart::ProductCode,
-            "the program on trial tells product code 000004D3h, and the bootloader of node 5 000004D2h",
-        ),
-        (
-            Told(|sub| (sub == 4).then_some(Ok(8)), Some(7)),
-            IdentityPart::SerialNumber,
-            "the program on trial tells serial number 00000008h, and the bootloader of node 5 00000007h",
-        ),
-    ];
-    for (reported, part, words) in cases {
-        let (result, commands, running) = fake(reported, &trial);
+    for (reported, serial, part, tells, has) in [
+        ((1, Ok(0x40)), None, IdentityPart::VendorId, "vendor-ID 00000040h", "0000003Fh"),
+        ((1, Err(0x0602_0000)), None, IdentityPart::VendorId, "vendor-ID none", "0000003Fh"),
+        ((2, Ok(1235)), None, IdentityPart::ProductCode, "product code 000004D3h", "000004D2h"),
+        ((4, Ok(8)), Some(7), IdentityPart::SerialNumber, "serial number 00000008h", "00000007h"),
+    ] {
+        let (result, commands, running) = fake(Told(Some(reported), serial), &trial);
         let error = result.unwrap_err();
         assert!(matches!(error, Error::OtherIdentity { what, .. } if what == part), "{error}");
+        let words = &*format!("the program on trial tells {tells}, and the bootloader of node 5 {has}");
         assert_eq!((error.to_string().as_str(), error.number()), (words, 0x6000_0014));
         assert_eq!(commands[commands.len() - 2..], ["command 01", "command 80"]);
         assert_eq!(running, Some(BOOTLOADER));
     }
     // Without a trial the identity is not compared.
-    let other = Told(|sub| (sub == 1).then_some(Ok(0x40)), None);
+    let other = Told(Some((1, Ok(0x40))), None);
     assert!(fake(other, &FlashOptions::default().trial_run(false)).0.is_ok());
 }

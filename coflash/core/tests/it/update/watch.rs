@@ -7,8 +7,7 @@ use super::{file, left, node, update};
 use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
-use coboot_can::Adapter;
-use coboot_can::{AdapterError, Losses};
+use coboot_can::{Adapter, AdapterError, Losses};
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
@@ -292,12 +291,7 @@ fn many(bus: &mut dyn Adapter, nodes: &[u8]) -> Vec<Result<Report, (String, Devi
 }
 
 fn two() -> Bus {
-    let device = |node| {
-        let mut fake = Fake::new(BOOTLOADER);
-        fake.node = node;
-        fake
-    };
-    Bus(vec![device(5), device(6)])
+    Bus([5, 6].map(|node| Fake::new(BOOTLOADER).at(node, 1)).into())
 }
 
 /// Two devices side by side, of which one dies in its trial: the other one is finished.
