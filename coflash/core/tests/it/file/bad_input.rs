@@ -164,22 +164,16 @@ fn a_damaged_block_file_is_named_with_its_offset() {
     let crc_of = |block: &[u8]| CRC.checksum(block).to_le_bytes();
     // Data of block 1, which starts after the 24 bytes of block 0.
     assert!(with(0x30, 0).starts_with("offset 0x18: CRC of block 1 is 0xc2fbc65a"), "{}", with(0x30, 0));
-    assert!(
-        with(0x21, 0xFF).starts_with("offset 0x18: block 1 has 65478 data bytes"),
-        "{}",
-        with(0x21, 0xFF)
-    );
+    let long = with(0x21, 0xFF);
+    assert!(long.starts_with("offset 0x18: block 1 has 65478 data bytes"), "{long}");
     let mut renumbered = good.to_vec();
     renumbered[0x18] = 2;
     let crc = crc_of(&renumbered[0x18..0x2EA]);
     renumbered[0x2EA..0x2EE].copy_from_slice(&crc);
     let error = meaning(&renumbered, None).unwrap_err();
     assert!(error.starts_with("offset 0x18: block 2 follows where block 1 must"), "{error}");
-    let mut doubled = good.to_vec();
-    doubled.extend_from_slice(good);
-    assert!(meaning(&doubled, None)
-        .unwrap_err()
-        .starts_with("offset 0x373: there are more bytes after the last block"));
+    let error = meaning(&[good, good].concat(), None).unwrap_err();
+    assert!(error.starts_with("offset 0x373: there are more bytes after the last block"), "{error}");
     let no_program = [&good[..0x18], &good[0x35B..]].concat();
     assert_eq!(meaning(&no_program, None).unwrap_err(), "the file: holds no data");
     let mut wrong_crc = good.to_vec();
@@ -239,10 +233,8 @@ fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
     const LEN: u32 = 2_600_000;
     let bomb = elf(20_000, LEN as usize, |_| (0, 0x0801_0000, LEN));
     let error = meaning(&bomb, None).unwrap_err();
-    assert!(
-        error.starts_with("the file: its load segments have more than 67108864 bytes together"),
-        "{error}"
-    );
+    let words = "the file: its load segments have more than 67108864 bytes together";
+    assert!(error.starts_with(words), "{error}");
     // So many headers are not a fault by themselves.
     let bytes = elf(20_000, 0, |number| (52 + 4 * number, 0x0801_0000 + 4 * number, 4));
     assert_eq!(meaning(&bytes, None).unwrap().size(), 80_000);

@@ -260,12 +260,8 @@ fn the_region_decides_about_data_outside() {
     let range = |first, last| AddressRange { first, last };
 
     let error = with(Region::Strict(range(0x0801_0000, 0x0801_0F9F))).unwrap_err().to_string();
-    assert!(
-        error.starts_with(
-            "offset 0x362: the data at 0x08010f90..=0x08010fa0 lies outside 0x08010000..=0x08010f9f"
-        ),
-        "{error}"
-    );
+    let words = "offset 0x362: the data at 0x08010f90..=0x08010fa0 lies outside 0x08010000..=0x08010f9f";
+    assert!(error.starts_with(words), "{error}");
     // The manual's --start_address/--end_address leave it out.
     let cut = with(Region::Cut(range(0x0801_0000, 0x0801_02C5))).unwrap();
     assert_eq!((cut.program.size(), cut.left_out), (0x2C6, 8 + 17));

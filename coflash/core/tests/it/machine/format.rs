@@ -103,10 +103,8 @@ fn a_container_that_lies_is_refused() {
     assert_eq!(zip::read(&bytes(DEFLATED)).unwrap_err(), Fault::Packed("a.txt".to_owned()));
     // Both CRCs.
     let fault = changed(&[(14, &[0]), (DIRECTORY + 16, &[0])]);
-    assert_eq!(
-        (fault.number(), fault),
-        (0x6000_0405, Fault::Damaged { member: "a.txt".to_owned(), what: "CRC-32" })
-    );
+    let damaged = Fault::Damaged { member: "a.txt".to_owned(), what: "CRC-32" };
+    assert_eq!((fault.number(), fault), (0x6000_0405, damaged));
     // Names that are paths, on one system or another.
     for name in ["../ab", "/abcd", "a\\bcd", "C:abc", ".hide", "a/b.t", "a\0bcd", "\u{FC}bcd", "a bcd"] {
         let fault = changed(&[(30, name.as_bytes()), (DIRECTORY + 46, name.as_bytes())]);
@@ -128,12 +126,11 @@ fn two_members_have_two_names() {
 
 #[test]
 fn a_package_has_its_programs_in_order() {
+    let valve =
+        r#""identity": {"vendor": 1, "product": 1234}, "count": 3, "trial_run": false, "dialect": "raw""#;
     let file = packed(&[
         ("drive", r#""nodes": [5, 6], "identity": {"vendor": 63, "product": 1234, "revision": 2}"#),
-        (
-            "valve",
-            r#""identity": {"vendor": 1, "product": 1234}, "count": 3, "trial_run": false, "dialect": "raw""#,
-        ),
+        ("valve", valve),
         ("panel", r#""nodes": [9], "verify": true"#),
     ]);
     let package = Package::parse(&file).unwrap();
@@ -153,11 +150,8 @@ fn a_manifest_that_lies_is_refused() {
     let one = || manifest(&[entry("a", NODE)]);
     assert!(Package::parse(&package(&one(), &["a.blk"])).is_ok());
     refused(&package(&one(), &[]), 0x6000_0404, "no member \"a.blk\"");
-    refused(
-        &package(&one(), &["a.blk", "b.blk"]),
-        0x6000_0404,
-        "a member \"b.blk\" that its manifest does not list",
-    );
+    let other = package(&one(), &["a.blk", "b.blk"]);
+    refused(&other, 0x6000_0404, "a member \"b.blk\" that its manifest does not list");
     refused(&package(&one(), &["a.blk", "signatures.bin"]), 0x6000_0404, "signatures.bin");
     let changed = |from: &str, to: &str| {
         assert!(one().contains(from));
@@ -280,8 +274,7 @@ fn a_text_that_changes_how_a_line_looks_is_refused() {
     let hidden =
         ['\u{200B}', '\u{200F}', '\u{2028}', '\u{202E}', '\u{2060}', '\u{2066}', '\u{206F}', '\u{FEFF}'];
     for letter in hidden {
-        let text =
-            entry("a", r#""nodes": [5]"#).replace(r#""name": "a""#, &format!(r#""name": "a{letter}b""#));
+        let text = entry("a", NODE).replace(r#""name": "a""#, &format!(r#""name": "a{letter}b""#));
         refused(&package(&manifest(&[text]), &["a.blk"]), 0x6000_0406, "none for control");
         let field = entry("a", &format!(r#""nodes": [5], "x{letter}": 1"#));
         let fault = Package::parse(&package(&manifest(&[field]), &["a.blk"])).unwrap_err();

@@ -4,7 +4,7 @@ use coflash_core::file::sealed::{Certificate, PublicKey, Role, SigningKey};
 use coflash_core::machine::zip::{self, Member};
 use coflash_core::machine::{make, Entry, Fault, Identity, Package, Part, SignatureFault};
 
-use super::{refused, BLOCKS};
+use super::{entry, refused, BLOCKS};
 
 fn key(seed: u8) -> SigningKey {
     SigningKey::from_seed([seed; 32]).unwrap()
@@ -24,20 +24,9 @@ fn certificate(root: &SigningKey, key: &SigningKey, role: Role, product: u32) ->
 }
 
 fn part(identity: Option<Identity>) -> Part {
-    let entry = Entry {
-        name: "drive".to_owned(),
-        file: String::new(),
-        size: 0,
-        sha256: String::new(),
-        nodes: if identity.is_some() { vec![] } else { vec![5] },
-        identity,
-        count: None,
-        program: 1,
-        dialect: None,
-        trial_run: true,
-        verify: false,
-    };
-    Part { entry, bytes: BLOCKS.to_vec() }
+    let at_node: Entry = serde_json::from_str(&entry("drive", r#""nodes": [5]"#)).unwrap();
+    let nodes = if identity.is_some() { vec![] } else { vec![5] };
+    Part { entry: Entry { nodes, identity, ..at_node }, bytes: BLOCKS.to_vec() }
 }
 
 const DRIVE: Identity = Identity { vendor: 63, product: 1234, revision: None };
@@ -111,10 +100,8 @@ fn what_a_stranger_signs_counts_for_nothing() {
     let keys = [(&release, Some(certificate(&root, &release, Role::Release, 0))), (&stranger, None)];
     let bytes = made(&[part(Some(DRIVE)), panel], &keys).unwrap();
     let fault = trust(&bytes, &[root.public()]).unwrap_err();
-    assert!(
-        matches!(&fault, Fault::Signature(SignatureFault::NotAllowed { program, .. }) if program == "panel"),
-        "{fault}"
-    );
+    let Fault::Signature(SignatureFault::NotAllowed { program, .. }) = fault else { panic!("{fault}") };
+    assert_eq!(program, "panel");
 }
 
 /// The root is a stranger to whoever names another one: its signature is not among those that were checked.
@@ -161,9 +148,8 @@ fn no_changed_byte_changes_what_is_signed() {
 #[test]
 fn signatures_that_are_none_are_refused() {
     let (root, release) = (key(1), key(2));
-    let good =
-        made(&[part(Some(DRIVE))], &[(&release, Some(certificate(&root, &release, Role::Release, 0)))]);
-    let good = good.unwrap();
+    let certified = certificate(&root, &release, Role::Release, 0);
+    let good = made(&[part(Some(DRIVE))], &[(&release, Some(certified))]).unwrap();
     let with = |change: &dyn Fn(&mut Vec<u8>)| {
         let members = zip::read(&good).unwrap();
         let mut signatures = members[1].bytes.to_vec();

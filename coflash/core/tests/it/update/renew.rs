@@ -327,19 +327,8 @@ fn of_several_devices_the_first_one_goes_first() {
 #[test]
 fn a_package_renews_bootloaders() {
     use coflash_core::machine::{make, plan, run, Entry, Package, Part, RunOptions};
-    let entry = Entry {
-        name: "bootloader".to_owned(),
-        file: String::new(),
-        size: 0,
-        sha256: String::new(),
-        nodes: vec![5, 6, 7],
-        identity: None,
-        count: None,
-        program: 255,
-        dialect: None,
-        trial_run: true,
-        verify: false,
-    };
+    let entry = crate::machine::entry("bootloader", r#""nodes": [5, 6, 7]"#);
+    let entry = Entry { program: 255, ..serde_json::from_str(&entry).unwrap() };
     let package = make(None, None, &[Part { entry, bytes: image(NEW) }], &[]).unwrap();
     let package = Package::parse(&package).unwrap();
     let due = |bus: &mut Bus| {
