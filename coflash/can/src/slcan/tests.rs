@@ -355,21 +355,14 @@ fn login(line: &str, number: usize) -> String {
 #[test]
 fn what_is_no_adapter_is_refused_and_quoted() {
     const GPS: &[u8] = b"$GPGGA,120000,4807.038,N\r\n$GPGSA,A,3\r\n";
+    let gps = "it sent '$GPGGA,120000,4807.038,N'";
     for rate in [None, Some(125_000)] {
         for (name, mut device, said) in [
             ("silence", Device::new(nothing), "as an adapter does"),
             ("modem", Device::new(modem), "it sent 'ERROR'"),
             ("modem without echo", Device::new(modem_without_echo), "it sent 'ERROR'"),
-            (
-                "GPS receiver, 1 Hz",
-                Device::talks(nothing, GPS, 350, 1000),
-                "it sent '$GPGGA,120000,4807.038,N'",
-            ),
-            (
-                "GPS receiver, 10 Hz",
-                Device::talks(nothing, GPS, 350, 100),
-                "it sent '$GPGGA,120000,4807.038,N'",
-            ),
+            ("GPS receiver, 1 Hz", Device::talks(nothing, GPS, 350, 1000), gps),
+            ("GPS receiver, 10 Hz", Device::talks(nothing, GPS, 350, 100), gps),
             ("shell", Device::new(shell), "it sent 'bash: C: command not found'"),
             (
                 "monitor",
@@ -377,16 +370,8 @@ fn what_is_no_adapter_is_refused_and_quoted() {
                 "it sent 'C: unknown command'",
             ),
             ("login", Device::new(login), "it sent 'Password:'"),
-            (
-                "a plug that joins both wires",
-                Device::new(|line, _| format!("{line}\r")),
-                "it sent back what it got",
-            ),
-            (
-                "measuring device: a value for each line",
-                Device::new(|_, n| format!("+{n}.25\r\n")),
-                "it sent '+0.25'",
-            ),
+            ("both wires joined", Device::new(|line, _| format!("{line}\r")), "it sent back what it got"),
+            ("a value for each line", Device::new(|_, n| format!("+{n}.25\r\n")), "it sent '+0.25'"),
             (
                 "voltmeter",
                 Device::new(|line, n| if line == "V" { format!("12.{n}\r\n") } else { String::new() }),
@@ -394,19 +379,13 @@ fn what_is_no_adapter_is_refused_and_quoted() {
             ),
             ("text without CR", Device::talks(nothing, b"hello\n", 10, 10), "it sent 'hellohello"),
             ("bytes without a pause", Device::talks(nothing, &[b'x'; 100], 0, 1), "it sent 'xxxx"),
-            (
-                "lines without a pause",
-                Device::talks(nothing, b"xxxxxxxxxxxxxxxxxxxxxxx\r", 0, 1),
-                "it sent 'xxxx",
-            ),
+            ("no pause", Device::talks(nothing, b"xxxxxxxxxxxxxxxxxxxxxxx\r", 0, 1), "it sent 'xxxx"),
         ] {
             let error = open(&mut device, rate).map(drop).unwrap_err();
             let words = error.to_string();
-            assert!(
-                words.contains("it answered neither V (version) nor O (open the bus)"),
-                "{name}: {words}"
-            );
-            assert!(words.contains(said), "{name}: {words}");
+            for part in ["it answered neither V (version) nor O (open the bus)", said] {
+                assert!(words.contains(part), "{name}: {words}");
+            }
             assert!(error.advice().contains("not an SLCAN adapter"), "{name}: {}", error.advice());
             assert!(device.now < ms(8_000), "{name}: {:?}", device.now);
         }
@@ -425,13 +404,8 @@ fn an_adapter_that_refuses_or_changes_its_mind_is_named() {
         ("rate", (|line, n| but("S", "\x07", line, n)) as Answers, 125_000, "it refuses the bit rate"),
         ("bus", |line, n| but("O", "\x07", line, n), 125_000, "it refuses to open the bus"),
         ("no such rate", lawicel, 123_456, "it does not support 123456 bit/s"),
-        (
-            "S is acknowledged, O is not",
-            |line, n| but("O", "", line, n),
-            125_000,
-            "it acknowledges S4, but not O",
-        ),
-        ("O is acknowledged, S is not", opens, 125_000, "it acknowledges O, but not S4"),
+        ("S alone", |line, n| but("O", "", line, n), 125_000, "it acknowledges S4, but not O"),
+        ("O alone", opens, 125_000, "it acknowledges O, but not S4"),
     ] {
         let mut device = Device::new(answers);
         let error = open(&mut device, Some(rate)).map(drop).unwrap_err().to_string();
@@ -673,11 +647,8 @@ fn an_adapter_that_becomes_something_else_is_told() {
         let mut bus = open(&mut device, None).unwrap();
         bus.send(&frame(0x605, &[0x40])).unwrap();
         assert_eq!(bus.receive(ms(20)).unwrap(), None);
-        assert_eq!(
-            bus.health().map_or(0, |health| health.strange),
-            0,
-            "acknowledgements are of the protocol"
-        );
+        let strange = bus.health().map_or(0, |health| health.strange);
+        assert_eq!(strange, 0, "acknowledgements are of the protocol");
         bus.line.answers = Some(answers);
         for _ in 0..3 {
             bus.send(&frame(0x605, &[0x40])).unwrap();
