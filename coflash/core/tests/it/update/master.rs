@@ -5,16 +5,14 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coboot_can::Adapter;
-use coboot_can::AdapterError;
+use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Payload, Report};
 use coflash_core::Error;
 
-use super::left;
-use super::{file, update};
+use super::{file, left, update};
 use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER, NODE};
 
 const fn ms(time: u64) -> Duration {
