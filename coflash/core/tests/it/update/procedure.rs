@@ -464,8 +464,8 @@ fn an_answer_left_over_from_before_is_not_taken_for_one_to_this_request() {
     session.command(1, canopen::program::ProgramControl::Clear).unwrap();
 }
 
-/// Table 3, and table 10 of the manual for the numbers that it has. The last one is in no table, and has
-/// a detail.
+/// Table 3, and table 10 of the manual for the numbers that it has. The last one is in no
+/// table, and has a detail.
 const STATUS: [(u32, u32, &str); 15] = [
     (0x02, 0x6000_0001, "no valid program"),
     (0x04, 0x6000_0002, "expected form"),

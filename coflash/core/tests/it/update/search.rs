@@ -210,8 +210,8 @@ fn the_user_gives_up() {
     }
 }
 
-/// A sub-index of 1018h of the program on trial that has its own value or abort code, and the serial number
-/// of the bootloader, which has vendor-ID 3Fh and product code 1234.
+/// A sub-index of 1018h of the program on trial that has its own value or abort code, and the serial
+/// number of the bootloader, which has vendor-ID 3Fh and product code 1234.
 struct Told(Option<(u8, Result<u32, u32>)>, Option<u32>);
 
 impl Maker for Told {
