@@ -538,16 +538,16 @@ fn a_refused_frame_is_sent_again_in_its_order() {
             assert_eq!((&all, none), (&sent, 0));
             for size in [3, 16, 64].into_iter().filter(|size| *size >= shortest) {
                 let (mut bus, time, refused) = sub_blocks(queue(size), rate, latency, baud);
-                // In these sub-blocks a frame was on its way when the one before was refused.
-                let late =
-                    bus.chunks(127).zip(sent.chunks(127)).filter(|(there, sent)| there != sent).count();
+                // A frame that was on its way when the one before was refused.
+                let late = bus.iter().zip(&sent).filter(|(there, sent)| there != sent).count();
                 let ratio = time.as_secs_f64() / free.as_secs_f64();
                 let at = format!("{size} frames, {rate} bit/s, {latency} us, {baud} baud, others {others:?}");
                 let at = format!("{at}: {refused} refused, {late} late, {ratio:.2} of the time");
-                // What a slow line cannot send meanwhile is lost.
-                assert!(ratio <= if baud < 1_000_000 { 1.5 } else { 1.3 }, "{at}");
-                let (part, most) = if others.1 == 0 { (20, 4) } else { (4, 8) };
-                assert!(refused <= sent.len() as u32 / part && late <= most, "{at}");
+                let is_alone = others.1 == 0;
+                // What a slow line cannot send while others have the bus is lost.
+                assert!(ratio <= if is_alone || baud >= 1_000_000 { 1.3 } else { 1.5 }, "{at}");
+                assert!(refused <= sent.len() as u32 / if is_alone { 20 } else { 4 }, "{at}");
+                assert!(late <= 30 || !is_alone, "{at}");
                 bus.sort();
                 assert_eq!(bus, sent, "{at}");
             }
