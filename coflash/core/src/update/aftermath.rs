@@ -97,9 +97,7 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
                 }
             }
             // The old program may have the same CRC.
-            reported @ Some(_) if update.known.postponed && reported == update.known.before => {
-                DeviceState::Postponed
-            }
+            reported if update.known.postponed && reported == update.known.before => DeviceState::Postponed,
             Some(reported) if wrote && crcs.contains(&reported) && answers.control.is_some() => {
                 DeviceState::Unreleased
             }
@@ -111,8 +109,12 @@ fn judge(update: &RunningUpdate<'_>, answers: &Answers, crcs: [u32; 2], error: &
 
 #[cfg(test)]
 mod tests {
+    use canopen::AbortCode;
+
+    use super::super::event::Phase;
     use super::super::running::Known;
     use super::*;
+    use crate::device::Doing;
     use crate::update::options::FlashOptions;
 
     /// A program that runs is the new one if the device says so and had another CRC before; otherwise the old one.
@@ -143,6 +145,31 @@ mod tests {
             let node = canopen::NodeId::MAX;
             let update = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
             assert_eq!(judge(&update, &answers, [NEW, 0xBEEF], &Error::Cancelled), left, "{crc}");
+        }
+    }
+
+    /// An earlier attempt has seen the end of the erase, or this one sees that there is no program: a refusal and a
+    /// short erase say nothing more.
+    #[test]
+    fn a_second_attempt_knows_what_the_first_one_did() {
+        for (took, crc) in [(1, Some(0)), (1, None), (0, Some(0))] {
+            let mut known = Known::default();
+            let (node, nobody) = (canopen::NodeId::MAX, &mut |_| {});
+            let mut first = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
+            first.erases(crc.map(|_| 0x0BAD_CAFE));
+            first.report(Phase::Erased { took: Duration::from_secs(took) }.into());
+            let mut second = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
+            second.erases(crc);
+            assert_eq!(second.last_known(), DeviceState::Erased, "{took} s, {crc:?}");
+            if crc.is_some() {
+                second.report(Phase::Erased { took: Duration::ZERO }.into());
+                second.erase_failed(&Error::Refused {
+                    node,
+                    doing: Doing::Program,
+                    code: AbortCode::GENERAL,
+                });
+                assert_eq!(second.last_known(), DeviceState::Erased, "{took} s, {crc:?}");
+            }
         }
     }
 }

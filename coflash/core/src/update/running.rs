@@ -10,7 +10,7 @@ use super::event::{Event, Note, Phase, Warning};
 use super::options::FlashOptions;
 use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
-use crate::device::{Dialect, Error, Session};
+use crate::device::{Dialect, Doing, Error, Session};
 
 /// Carries out `work` in a session that reports silence of the node as an event.
 pub(super) fn reporting_silence<R>(
@@ -49,7 +49,7 @@ pub struct Known {
     /// Whether the device has not acknowledged the erase yet, or has postponed it and has acknowledged no data
     /// since then.
     pub(super) postponed: bool,
-    /// Whether the device may contain a part of the new program.
+    /// Whether the device may contain a part of the new program, or has lost the old one for it.
     pub(super) wrote: bool,
 }
 
@@ -159,13 +159,20 @@ impl<'t> RunningUpdate<'t> {
         known.touched = true;
         if known.state != DeviceState::Erased {
             known.state_before = std::mem::replace(&mut known.state, DeviceState::Erased);
-            known.before = before;
+            // Until the device has said that it is done, it may have its program.
+            (known.before, known.postponed) = (before, before != Some(0));
+        } else if before == Some(0) && known.before.is_some_and(|crc| crc != 0) {
+            // An earlier attempt has erased it.
+            (known.wrote, known.postponed) = (true, false);
         }
     }
 
-    /// Records that the device has refused the erase.
-    pub(super) fn erases_not(&mut self) {
-        if self.known.state == DeviceState::Erased && !self.known.wrote {
+    /// Records the failure of the erase, or of what it needs. If the device has refused that, it has erased
+    /// nothing; one that refuses a question after it may have.
+    pub(super) fn erase_failed(&mut self, error: &Error) {
+        let is_question = matches!(error, Error::Refused { doing: Doing::Read(_), .. });
+        let is_refused = error.is_refusal() && !is_question || matches!(error, Error::NotInDialect { .. });
+        if is_refused && self.known.state == DeviceState::Erased && !self.known.wrote {
             self.known.state = self.known.state_before;
         }
     }
@@ -181,10 +188,6 @@ impl<'t> RunningUpdate<'t> {
     /// Reports an event.
     pub(super) fn report(&mut self, event: Event) {
         match &event {
-            // Until the device has said that it is done, it may have its program.
-            Event::Phase(Phase::Erasing) => {
-                self.known.postponed = !self.known.wrote && self.known.before != Some(0)
-            }
             Event::Phase(Phase::Erased { took }) => {
                 self.known.postponed = *took < PUT_OFF && !self.known.wrote
             }

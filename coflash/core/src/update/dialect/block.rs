@@ -238,9 +238,7 @@ fn send(
         update.known.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
         update.report(Phase::GoingOn { done: done.min(total), total }.into());
     } else if let Err(error) = steps::erase(session, number, &mut |event| update.report(event)) {
-        if error.is_refusal() {
-            update.erases_not();
-        }
+        update.erase_failed(&error);
         return Err(error);
     }
     let began = session.now();

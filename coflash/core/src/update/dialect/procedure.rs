@@ -186,10 +186,7 @@ pub(super) fn send(
     let mut repeats = Repeats { block: None, count: 0, of: update.options.repeats };
     loop {
         if let Err(error) = procedure.prepare(session, number, update) {
-            // A refused password erases nothing, and neither does a refused command.
-            if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
-                update.erases_not();
-            }
+            update.erase_failed(&error);
             return Err(error);
         }
         update.report(Event::Progress { done: 0, total });

@@ -60,7 +60,6 @@ impl Procedure for Renew {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         (update.known.state, update.known.touched) = (DeviceState::Called, true);
-        update.losses = Some(session.losses());
         let result = renew(session, file, update);
         // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in
         // a device that is silent; the next power-on starts it there.
@@ -110,7 +109,8 @@ fn renew(
         return Ok(unchanged);
     }
     update.report(Phase::Renewing { number, from: from.0, to: to.0 }.into());
-    if !(is_same && is_open) {
+    let is_tried = is_same && is_open;
+    if !is_tried {
         leave_trial(session, number, running, update)?;
         let began = session.now();
         let content = file.encoded(Form::Image);
@@ -121,6 +121,10 @@ fn renew(
             return Ok(unchanged);
         }
         update.report(Phase::Staged.into());
+    }
+    // From here on a silence may be that of the image on trial, or of the adapter.
+    update.losses = Some(session.losses());
+    if !is_tried {
         try_it(session, number)?;
     }
     update.report(Phase::OnTrial.into());

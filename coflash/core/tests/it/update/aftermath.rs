@@ -188,6 +188,54 @@ fn without_an_answer_a_postponed_erase_is_not_called_done() {
     }
 }
 
+/// 1F57h is refused once, after so many commands CLEAR; whether the device has erased at the command.
+struct NoStatus {
+    clears: u32,
+    erases: bool,
+    crc: Option<u32>,
+}
+
+impl Maker for NoStatus {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        match at {
+            (0x1F57, 1) if self.clears == 1 => {
+                self.clears = 2;
+                Some(Err(0x0504_0001))
+            }
+            (0x1F56, 1) => match self.crc {
+                Some(_) if self.erases && self.clears > 0 => Some(Ok(vec![0; 4])),
+                Some(crc) => Some(Ok(crc.to_le_bytes().into())),
+                None => Some(Err(0x0602_0000)),
+            },
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, at: (u16, u8), data: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        self.clears += u32::from((at, data) == ((0x1F51, 1), &[CLEAR]));
+        None
+    }
+}
+
+/// A device that refuses a question after it has taken CLEAR has not refused CLEAR.
+#[test]
+fn a_refused_question_after_the_erase_is_no_refusal_of_the_erase() {
+    for kind in STANDARD {
+        for (erases, crc, state) in [
+            (true, Some(0x0BAD_CAFE), DeviceState::Erased),
+            (false, Some(0x0BAD_CAFE), DeviceState::Untouched),
+            (false, None, DeviceState::Postponed),
+        ] {
+            let refuses = |fake: &mut Fake| {
+                fake.maker = Some(Box::new(NoStatus { clears: 0, erases, crc }));
+                fake.erase_time = Duration::ZERO;
+            };
+            let there = left(BOOTLOADER, &refuses, dialect(kind));
+            assert_eq!(there.state, state, "{kind}, erases: {erases}, {crc:?}: {there}");
+        }
+    }
+}
+
 /// A device with a begun download (2006h) of the file that has no data yet; and 1F57h until CLEAR.
 struct Begun(u32);
 

@@ -3,7 +3,8 @@
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use canopen::NodeId;
+use canopen::{Frame, NodeId};
+use coboot_can::{Adapter, AdapterError, Losses};
 use coflash_core::device::info::info;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::device::{Session, Timing};
@@ -99,6 +100,39 @@ fn the_end_of_a_trial_is_told_in_words() {
         assert!(error.advice().to_string().contains("nothing is lost"), "{}", error.advice());
         assert_eq!(written(&log), &WHOLE[..3], "83h is not written to the old one");
     }
+}
+
+/// A device that falls silent with the first data, when its adapter has lost a frame.
+struct Dying(Fake, Losses);
+
+impl Adapter for Dying {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if frame.exactly::<8>().is_some_and(|sent| sent[1..4] == [0x50, 0x1F, 2]) {
+            (self.0.running, self.1.lost) = (None, 1);
+        }
+        self.0.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        self.0.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.0.now()
+    }
+
+    fn losses(&self) -> Losses {
+        self.1
+    }
+}
+
+/// A frame that was lost before the trial says nothing of it.
+#[test]
+fn a_device_that_dies_before_its_trial_has_had_none() {
+    let mut dying = Dying(device(BOOTLOADER, |_| {}).0, Losses::default());
+    let (result, _) = update(&mut dying, new(), &FlashOptions::default());
+    assert_eq!(dying.1.lost, 1);
+    assert!(matches!(result, Err(Error::NoAnswer { .. })), "{result:?}");
 }
 
 /// An image that nobody reaches ends after a minute; the tool waits for the old one, and says so.
