@@ -338,7 +338,7 @@ impl State {
             return left;
         }
         // Another device may be there since then.
-        let known = self.known.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
+        let known = self.known.get(&node).filter(|(known, _)| may_be_of(*known, serial));
         known.map_or(left, |(_, state)| *state)
     }
 
@@ -521,6 +521,12 @@ impl Notice {
     }
 }
 
+/// Whether what is known of a device with this serial number (1018h/4) may be of the one that is there now. A
+/// device may not answer, or its application may not have the object.
+pub(super) fn may_be_of(known: Option<u32>, now: Option<u32>) -> bool {
+    known.is_none() || now.is_none() || known == now
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -538,5 +544,10 @@ mod tests {
         assert_eq!(after(Some(1), erased), erased);
         let later = [Some(1), Some(2), None].map(|serial| after(serial, untouched));
         assert_eq!(later, [erased, untouched, erased]);
+        // Nor had it one at first.
+        assert_eq!(
+            [None, Some(1)].map(|serial| [after(serial, erased), after(Some(1), untouched)]),
+            [[erased; 2]; 2]
+        );
     }
 }

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::message::Message;
 use super::trouble;
-use crate::state;
+use crate::state::{self, may_be_of};
 
 /// A device, or one that is missing.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -266,7 +266,8 @@ impl Known {
     pub(super) fn recall(&mut self, rows: &mut [Row]) {
         let serials: BTreeSet<u32> = rows.iter().filter_map(|row| row.identity[3]).collect();
         // Of another machine nothing is known.
-        if !serials.is_empty() && serials.is_disjoint(&self.machine) {
+        let are_known = !serials.is_empty() && !self.machine.is_empty();
+        if are_known && serials.is_disjoint(&self.machine) {
             *self = Self::default();
         }
         for row in rows {
@@ -275,8 +276,7 @@ impl Known {
             let has_program = row.steps.iter().any(|step| step.from.is_some());
             match (row.state, row.left) {
                 (RowState::Failed, None | Some("left-untouched")) => {
-                    let known =
-                        self.devices.get(&node).filter(|(known, _)| serial.is_none() || serial == *known);
+                    let known = self.devices.get(&node).filter(|(known, _)| may_be_of(*known, serial));
                     row.left = known.map(|(_, left)| *left).or(row.left);
                 }
                 (RowState::Failed, Some(left)) => {
