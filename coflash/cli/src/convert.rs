@@ -165,6 +165,7 @@ impl Convert {
             return Err(Failure::usage(what, "name another file for the result"));
         }
         let (firmware, _) = self.source.load(input, self.program)?;
+        let is_done = matches!(firmware, Firmware::Blocks(_));
         let of_image = self.labels.vid.is_none() && matches!(firmware, Firmware::Image(_));
         if let Firmware::Blocks(program) = &firmware {
             // Blocks are copied unchanged, including their CRC.
@@ -189,6 +190,9 @@ impl Convert {
         };
         match (board, judged, StackAtEnd::of(image, start)) {
             (Some(_), Err(fault), _) => return Err(Failure::no_program(input, fault)),
+            // Its addresses are those that a person has asked for.
+            (None, Err(Fault::Elsewhere { area: Area::Alias, .. }), _)
+                if self.source.adjusts() || is_done => {}
             // The manual's tool converts any data, and so does this one for a board that it does not know.
             (None, Err(fault), _) => context.out.warn(format_args!("{file}: {fault}: {}", fault.advice())),
             (None, Ok(()), Some(stack)) => context.out.warn(format_args!("{file}: {stack}")),

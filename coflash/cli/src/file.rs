@@ -131,6 +131,11 @@ impl From<FormatName> for Format {
 }
 
 impl Source {
+    /// Whether the addresses of the program are moved.
+    pub(super) const fn adjusts(&self) -> bool {
+        self.place.adjust_start != 0
+    }
+
     /// Reads `file`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
         self.place.load(file, program)

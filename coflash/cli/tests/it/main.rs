@@ -200,6 +200,13 @@ fn each_fault_of_a_file_says_what_to_do() {
     let low = fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", "", 1);
     let done = coflash(&["convert", &folder.file("low.hex", low.as_bytes()), &folder.path("out.blk")]).good();
     assert!(done.err.contains("S3 records") && done.err.contains("warning"), "{}", done.err);
+    // Addresses that a person has moved are as they were asked for, also in a block file.
+    for (file, options) in [("program.hex", &["--adjust-start", "0xF8000000"][..]), ("adjusted-400.blk", &[])]
+    {
+        let words = ["convert", &data(file), &folder.path("out.blk")];
+        let done = coflash(&[&words[..], options].concat()).good();
+        assert!(!done.err.contains("warning"), "{file}: {}", done.err);
+    }
 }
 
 #[test]

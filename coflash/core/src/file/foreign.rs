@@ -14,8 +14,10 @@ pub struct Foreign {
 /// The header of an image for MCUboot (bootutil/image.h: `IMAGE_MAGIC`); `IMAGE_MAGIC_V1` begins with 3Ch.
 pub(super) const MCUBOOT: [u8; 4] = *b"\x3D\xB8\xF3\x96";
 
+const TEXT_WITH_PLACES: Foreign = Foreign { what: "a TI-TXT or Verilog file", advice: &Advice::Linked };
+
 /// First bytes. Letters may be small or capital. No initial stack pointer, a multiple of 8 in the RAM, begins so.
-static KNOWN: [(&[u8], Foreign); 20] = [
+static KNOWN: [(&[u8], Foreign); 22] = [
     (b"\x1F\x8B", Foreign { what: "a gzip archive", advice: &Advice::Unpack }),
     (b"BZh", Foreign { what: "a bzip2 archive", advice: &Advice::Unpack }),
     (b"\xFD7zXZ\0", Foreign { what: "an xz archive", advice: &Advice::Unpack }),
@@ -29,12 +31,14 @@ static KNOWN: [(&[u8], Foreign); 20] = [
     (b"\x3C\xB8\xF3\x96", Foreign { what: "an image for MCUboot (96F3B83Ch)", advice: &Advice::Unsigned }),
     (b"SFU1", Foreign { what: "an image for ST's secure boot (SBSFU)", advice: &Advice::Linked }),
     (b"0000000", Foreign { what: "a dump in hexadecimal digits (xxd, hexdump)", advice: &Advice::Linked }),
-    (b"@08", Foreign { what: "a TI-TXT or Verilog file", advice: &Advice::Linked }),
-    (b"@00", Foreign { what: "a TI-TXT or Verilog file", advice: &Advice::Linked }),
+    (b"@08", TEXT_WITH_PLACES),
+    (b"@00", TEXT_WITH_PLACES),
     (b"MZ", Foreign { what: "a program for Windows", advice: &Advice::Linked }),
     (b"-----BEGIN ", Foreign { what: "a text in PEM: a key or a certificate", advice: &Advice::Linked }),
     (b"version https:", Foreign { what: "a pointer of Git LFS (git lfs pull)", advice: &Advice::FetchAgain }),
-    (b"<", Foreign { what: "a page of the web, or XML", advice: &Advice::FetchAgain }),
+    (b"<!", Foreign { what: "a page of the web, or XML", advice: &Advice::FetchAgain }),
+    (b"<?", Foreign { what: "a page of the web, or XML", advice: &Advice::FetchAgain }),
+    (b"<h", Foreign { what: "a page of the web, or XML", advice: &Advice::FetchAgain }),
     (b"{\"", Foreign { what: "a text in JSON", advice: &Advice::FetchAgain }),
 ];
 
@@ -51,7 +55,10 @@ static ESP: Foreign = Foreign { what: "an image for an ESP32 or ESP8266", advice
 
 /// What the first bytes of a file say, after blanks.
 pub(super) fn name(bytes: &[u8]) -> Option<Foreign> {
-    of_image(bytes.trim_ascii_start())
+    match bytes.trim_ascii_start() {
+        [b'@', digit, ..] if digit.is_ascii_hexdigit() => Some(TEXT_WITH_PLACES),
+        bytes => of_image(bytes),
+    }
 }
 
 /// What the first bytes of an image say.

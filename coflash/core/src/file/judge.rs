@@ -497,6 +497,8 @@ mod tests {
             // RFC 1952 section 2.3.1; HTML; the pointer of Git LFS's specification; esptool's image of three segments.
             (b"\x1F\x8B\x08", "is not a program but a gzip archive"),
             (b"<!DOCTYPE html>", "is not a program but a page of the web"),
+            // The stack pointer 2001003Ch begins as XML does.
+            (b"\x3C\x00\x01\x20", "is linked for 08010200h, and the program begins at 08010000h"),
             (b"version https://git-lfs.github.com/spec/v1", "is not a program but a pointer of Git LFS"),
             (b"\xE9\x03\x02\x20", "is not a program but an image for an ESP32"),
             // POSIX.1, "ustar Interchange Format": the magic follows 257 bytes.

@@ -89,6 +89,7 @@ fn a_container_is_named_with_what_to_do() {
         (b"DfuSe\x01", "a DfuSe file"),
         (b"UF2\nWQ]\x9E", "a UF2 file"),
         (b"@08010000\n", "a TI-TXT or Verilog file"),
+        (b"@F800\n", "a TI-TXT or Verilog file"),
         (b"\x3D\xB8\xF3\x96\0\0\0\0", "an image for MCUboot"),
         (b"00000000: 0001 0220", "a dump in hexadecimal digits"),
         // The suffix of USB DFU 1.1, appendix B.
