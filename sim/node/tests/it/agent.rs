@@ -50,15 +50,14 @@ pub fn serve(config: &Config, options: &Options) -> (Ended, String) {
     };
     let open = |url: &str| Link::open(url, None).map_err(|error| error.to_string());
     let buses = Buses::new(&open, options.cancelled.clone());
-    let ended = loop {
-        match run(config, options, &buses, &show) {
-            // A child that another test has just begun may still hold the lock of an agent that has ended.
-            Err(error) if error.to_string().contains("another agent") => {
-                thread::sleep(Duration::from_millis(10))
-            }
-            ended => break ended.unwrap(),
-        }
-    };
+    // A child that another test has just begun may still hold the lock of an agent that has ended.
+    let mut attempts = (0..1_000).map(|_| run(config, options, &buses, &show));
+    let ended = attempts.find(|ended| {
+        let is_locked = ended.as_ref().is_err_and(|error| error.to_string().contains("another agent"));
+        thread::sleep(Duration::from_millis(if is_locked { 10 } else { 0 }));
+        !is_locked
+    });
+    let ended = ended.expect("the lock of an agent that has ended is free").unwrap();
     (ended, said.into_inner().unwrap())
 }
 

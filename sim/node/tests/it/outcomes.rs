@@ -402,6 +402,8 @@ impl Bench {
         let number = if self.fate == "returns" { 1 } else { 2 };
         let is_open =
             self.server.state().targets["press"].action.as_ref().is_some_and(|it| it.result.is_none());
+        let goes_on = self.row.text("fate") == "KILL" && self.fate.is_empty();
+        assert!(is_open || !goes_on, "the end of an agent is no result of its action");
         if !is_open {
             self.server.assign("press", Action::new(number, &File::new(file, &self.folder.read(file))));
         }
@@ -412,7 +414,10 @@ impl Bench {
             self.strike(|_| cancelled.store(true, Ordering::Relaxed));
             agent.join().unwrap_or_else(|why| resume_unwind(why));
         });
-        self.server.action("press").details("closed")
+        let action = self.server.action("press");
+        let resumes = |(execution, _): &(String, _)| execution == "resumed";
+        assert!(!goes_on || action.feedback.iter().any(resumes), "{:?}", action.feedback);
+        action.details("closed")
     }
 
     /// Updates by the service page; what it shows of each device, and the tables of its reports.
