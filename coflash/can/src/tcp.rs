@@ -2,34 +2,41 @@
 
 use std::io::{self, ErrorKind, Read};
 use std::net::{TcpStream, ToSocketAddrs};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::adapter::AdapterError;
 
 /// How long a server may take to accept the connection, and to accept data.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(3);
 
-/// A wait that is shorter than the clocks of some systems can tell is made of such pauses.
-const SHORT: Duration = Duration::from_millis(5);
-const SLICE: Duration = Duration::from_micros(100);
-
 /// Whether the error only means that the socket has no data, or no room, at present.
 pub(crate) fn waits(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 
-/// Reads what arrives within this time. (The system rounds a time-out up to its tick of some milliseconds.)
+/// Reads what arrives within this time. The stream's own time-out would be rounded up to the system's tick of some
+/// milliseconds.
+#[cfg(unix)]
 pub(crate) fn read_within(stream: &mut TcpStream, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
-    if timeout >= SHORT {
-        stream.set_read_timeout(Some(timeout))?;
-        return stream.read(bytes);
+    use rustix::event::{poll, PollFd, PollFlags, Timespec};
+
+    let timeout = Timespec::try_from(timeout).map_err(|_| ErrorKind::InvalidInput)?;
+    match poll(&mut [PollFd::new(stream, PollFlags::IN)], Some(&timeout))? {
+        0 => Err(ErrorKind::TimedOut.into()),
+        _ => stream.read(bytes),
     }
+}
+
+/// Reads what arrives within this time, in pauses that are shorter than the system's tick.
+#[cfg(not(unix))]
+pub(crate) fn read_within(stream: &mut TcpStream, bytes: &mut [u8], timeout: Duration) -> io::Result<usize> {
     stream.set_nonblocking(true)?;
-    let end = Instant::now() + timeout;
+    let end = std::time::Instant::now() + timeout;
     let read = loop {
         match stream.read(bytes) {
-            Err(error) if waits(&error) && Instant::now() < end => thread::sleep(SLICE),
+            Err(error) if waits(&error) && std::time::Instant::now() < end => {
+                std::thread::sleep(Duration::from_micros(100));
+            }
             read => break read,
         }
     };
