@@ -152,23 +152,23 @@ mod tests {
     /// short erase say nothing more.
     #[test]
     fn a_second_attempt_knows_what_the_first_one_did() {
-        for (took, crc) in [(1, Some(0)), (1, None), (0, Some(0))] {
+        for (postponed, crc) in [(false, Some(0)), (false, None), (true, Some(0))] {
             let mut known = Known::default();
             let (node, nobody) = (canopen::NodeId::MAX, &mut |_| {});
             let mut first = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
             first.erases(crc.map(|_| 0x0BAD_CAFE));
-            first.report(Phase::Erased { took: Duration::from_secs(took) }.into());
+            first.report(Phase::Erased { took: Duration::ZERO, postponed: Some(postponed) }.into());
             let mut second = RunningUpdate::new(node, FlashOptions::default(), &mut known, nobody);
             second.erases(crc);
-            assert_eq!(second.last_known(), DeviceState::Erased, "{took} s, {crc:?}");
+            assert_eq!(second.last_known(), DeviceState::Erased, "{postponed}, {crc:?}");
             if crc.is_some() {
-                second.report(Phase::Erased { took: Duration::ZERO }.into());
+                second.report(Phase::Erased { took: Duration::ZERO, postponed: None }.into());
                 second.erase_failed(&Error::Refused {
                     node,
                     doing: Doing::Program,
                     code: AbortCode::GENERAL,
                 });
-                assert_eq!(second.last_known(), DeviceState::Erased, "{took} s, {crc:?}");
+                assert_eq!(second.last_known(), DeviceState::Erased, "{postponed}, {crc:?}");
             }
         }
     }

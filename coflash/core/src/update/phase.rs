@@ -16,10 +16,6 @@ use crate::file::{self, Target};
 use crate::json;
 use shared_abi::ram_image::Version;
 
-/// An erase that ends within this time was postponed by the device, or had nothing to do: to erase
-/// a flash sector takes longer.
-pub(super) const PUT_OFF: Duration = Duration::from_millis(100);
-
 /// The phase of an update.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "phase", rename_all = "snake_case")]
@@ -36,11 +32,14 @@ pub enum Phase {
     InBootloader,
     /// Step 4: the program is being erased.
     Erasing,
-    /// Step 5: the program is erased.
+    /// Step 5: the command to erase is carried out.
     Erased {
-        /// How long the erase took.
+        /// How long it took.
         #[serde(rename = "seconds", serialize_with = "json::seconds")]
         took: Duration,
+        /// Whether the device still has its program, as 1F56h says: it has postponed the erase until the first good
+        /// block. `None` from a device without 1F56h.
+        postponed: Option<bool>,
     },
     /// Instead of steps 4 and 5: the device has a part of this file from a download that was cut
     /// off.
@@ -201,10 +200,15 @@ impl fmt::Display for Phase {
             Self::CallingBack => f.write_str("calling the application back to the bootloader"),
             Self::InBootloader => f.write_str("the bootloader is running"),
             Self::Erasing => f.write_str("commanding the device to erase the old program"),
-            Self::Erased { took } if *took < PUT_OFF => {
+            Self::Erased { postponed: Some(true), .. } => {
                 f.write_str("the device has postponed the erase until the first good block")
             }
-            Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
+            Self::Erased { took, postponed: Some(false) } => {
+                write!(f, "erased in {:.1} s", took.as_secs_f64())
+            }
+            Self::Erased { took, postponed: None } => {
+                write!(f, "the device has acknowledged the erase after {:.1} s", took.as_secs_f64())
+            }
             Self::GoingOn { done, total } => {
                 write!(f, "going on with a download that was cut off: the device has {done} of {total} bytes")
             }

@@ -8,7 +8,6 @@ use coboot_can::Losses;
 use super::device_after::DeviceState;
 use super::event::{Event, Note, Phase, Warning};
 use super::options::FlashOptions;
-use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
 use crate::device::{Dialect, Doing, Error, Session};
 
@@ -188,8 +187,8 @@ impl<'t> RunningUpdate<'t> {
     /// Reports an event.
     pub(super) fn report(&mut self, event: Event) {
         match &event {
-            Event::Phase(Phase::Erased { took }) => {
-                self.known.postponed = *took < PUT_OFF && !self.known.wrote
+            Event::Phase(Phase::Erased { postponed: Some(postponed), .. }) => {
+                self.known.postponed = *postponed && !self.known.wrote
             }
             Event::Phase(Phase::Verified { crc } | Phase::VerifiedAgain { crc }) => {
                 self.verified = Some(*crc)

@@ -7,7 +7,7 @@ use canopen::{AbortCode, Address};
 use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
-use super::phase::{Note, PUT_OFF};
+use super::phase::Note;
 use crate::device::error::{absent, reported, Error, IdentityPart};
 use crate::device::read_state::{autostart_words, program_start, state_after_failure};
 use crate::device::{DeviceType, Doing, Session, Timing};
@@ -160,7 +160,19 @@ pub fn erase(session: &mut Session<'_>, number: u8, on_event: &mut dyn FnMut(Eve
     on_event(Phase::Erasing.into());
     let began = session.now();
     execute(session, number, ProgramControl::Clear)?;
-    on_event(Phase::Erased { took: session.now().saturating_sub(began) }.into());
+    erased(session, number, began, on_event)
+}
+
+/// Reports the end of the command to erase, with what 1F56h says of it.
+fn erased(
+    session: &mut Session<'_>,
+    number: u8,
+    began: Duration,
+    on_event: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    let took = session.now().saturating_sub(began);
+    let postponed = crc(session, number)?.map(|crc| crc != 0);
+    on_event(Phase::Erased { took, postponed }.into());
     Ok(())
 }
 
@@ -180,20 +192,21 @@ pub(super) fn clear_and_wait(
     let node = session.node();
     let patient = session.timing().erasing();
     session.with(node, patient).command(number, ProgramControl::Clear)?;
-    on_event(Phase::Erased { took: session.now().saturating_sub(began) }.into());
-    Ok(())
+    erased(session, number, began, on_event)
 }
 
 /// Erases the program without writing another one. A bootloader that postpones the erase until the
 /// first block (figure 12 of the manual) gets the command a second time, which makes it erase at
-/// once; other bootloaders then erase empty flash.
+/// once; so does one of which 1F56h does not say that the first command has erased its program.
 ///
 /// # Errors
 /// As [`erase`].
 pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
-    let began = session.now();
+    let before = crc(session, number)?;
     execute(session, number, ProgramControl::Clear)?;
-    if session.now().saturating_sub(began) < PUT_OFF {
+    // Without a program before, nothing tells whether the rest of a cut-off download is gone.
+    let is_erased = before.is_some_and(|crc| crc != 0) && crc(session, number)? == Some(0);
+    if !is_erased {
         execute(session, number, ProgramControl::Clear)?;
     }
     Ok(())
@@ -294,8 +307,8 @@ pub(super) fn identification(session: &mut Session<'_>, number: u8) -> Result<u3
     session.read_number(Address::new(program::PROGRAM_ID, number))
 }
 
-/// The value of 1F56h before the erase, if the device reports it, for a comparison after a failure.
-pub(super) fn crc_before(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
+/// The value of 1F56h, if the device reports it.
+pub(super) fn crc(session: &mut Session<'_>, number: u8) -> Result<Option<u32>, Error> {
     match identification(session, number) {
         Ok(crc) => Ok(Some(crc)),
         Err(error @ (Error::Adapter(_) | Error::Cancelled)) => Err(error),

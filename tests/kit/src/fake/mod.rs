@@ -107,6 +107,8 @@ pub struct Fake {
     /// What 1F50h/1 reads, if the device allows that.
     pub readable: Option<Vec<u8>>,
     pub erase_time: Duration,
+    /// The CRC of the program that it has, and how many commands CLEAR erase it if no data come.
+    pub had: Option<(u32, u32)>,
     pub restart_time: Duration,
     /// How long it still answers before it restarts.
     pub leave_time: Duration,
@@ -186,6 +188,7 @@ impl Fake {
             busy_until: Duration::ZERO,
             status: 0,
             crc: None,
+            had: None,
             crc_of_application: None,
             deaf_while_busy: false,
             readable: None,
@@ -502,7 +505,8 @@ impl Fake {
                 let last = self.blocks.last().filter(|block| block[0] == 0xFF);
                 let crc = last.map_or(0, |block| u32::from_le_bytes(block[16..20].try_into().unwrap()));
                 let application = self.crc_of_application.filter(|_| self.running == Some(APPLICATION));
-                number(application.or(self.crc).unwrap_or(crc))
+                let had = self.had.map(|(crc, _)| crc);
+                number(application.or(self.crc).or(had).unwrap_or(crc))
             }
             (0x2007, sub @ 2..=4) => {
                 self.state.map(|state| vec![state[usize::from(sub) - 2]]).ok_or(0x0602_0000)
@@ -587,11 +591,13 @@ impl Fake {
                     return;
                 }
                 self.next_block = number.wrapping_add(1);
+                self.had = self.had.filter(|_| number == 0);
                 self.busy_until = self.now + Duration::from_millis(4);
                 self.blocks.push(data);
             }
             (0x1F51, 0x03) if in_bootloader => {
                 self.busy_until = self.now + self.erase_time;
+                self.had = self.had.map(|(crc, clears)| (crc, clears - 1)).filter(|(_, clears)| *clears > 0);
                 self.blocks.clear();
                 self.next_block = 0;
             }

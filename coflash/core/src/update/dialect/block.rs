@@ -229,7 +229,7 @@ fn send(
     update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
     let number = update.options.program;
-    let before = steps::crc_before(session, number)?;
+    let before = steps::crc(session, number)?;
     update.erases(before);
     if let Some(partial) = partial {
         let total = file.own.size() as usize;

@@ -154,7 +154,7 @@ pub(super) fn download(
 ) -> Result<Downloaded, Error> {
     let number = update.options.program;
     let began = session.now();
-    let before = steps::crc_before(session, number)?;
+    let before = steps::crc(session, number)?;
     update.erases(before);
     let content = file.encoded(update.dialect.form());
     let repeats = send(procedure, session, number, &content, Doing::Program, update)?;

@@ -124,7 +124,11 @@ fn the_names_of_the_course_stay() {
         ("calling_back", Phase::CallingBack, json!({})),
         ("in_bootloader", Phase::InBootloader, json!({})),
         ("erasing", Phase::Erasing, json!({})),
-        ("erased", Phase::Erased { took: TOOK }, json!({ "seconds": 1.235 })),
+        (
+            "erased",
+            Phase::Erased { took: TOOK, postponed: Some(true) },
+            json!({ "seconds": 1.235, "postponed": true }),
+        ),
         ("verified", Phase::Verified { crc: 7 }, json!({ "crc": 7 })),
         ("trial_starting", Phase::TrialStarting, json!({})),
         ("trial_passed", Phase::TrialPassed(application), program()),
