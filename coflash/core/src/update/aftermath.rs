@@ -9,10 +9,12 @@ use canopen::Address;
 use super::device_after::{Answers, DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::running::RunningUpdate;
 use crate::device::error::{reported, Error};
-use crate::device::{DeviceType, Session, Timing};
+use crate::device::{DeviceType, Doing, Session, Timing};
 
 /// How long the device may take for its answer; there are two attempts.
 const ANSWER: Duration = Duration::from_millis(500);
+/// How long the device may take for the last data that it got: with them, its program may become complete.
+const LAST_DATA: Duration = Duration::from_secs(2);
 
 /// Asks the device for its state after the update. `crcs` are the values that 1F56h may have with the
 /// file's program.
@@ -31,10 +33,15 @@ pub(super) fn state_after(
     let (current, original) = (session.node(), update.original);
     let nodes = [current, original];
     for node in &nodes[..if current == original { 1 } else { 2 }] {
-        let timing = Timing { sdo: ANSWER.min(session.timing().sdo), attempts: 2, ..*session.timing() };
+        let timing = Timing {
+            sdo: ANSWER.min(session.timing().sdo),
+            attempts: 2,
+            command: LAST_DATA.min(session.timing().command),
+            ..*session.timing()
+        };
         let mut asked = session.with(*node, timing);
         asked.cancel_by_nobody();
-        match ask(&mut asked, number) {
+        match ask(&mut asked, number, update.known.wrote) {
             Ok(answers) => {
                 return DeviceAfterUpdate {
                     state: judge(update, &answers, crcs, error),
@@ -48,8 +55,13 @@ pub(super) fn state_after(
     without(DeviceAnswer::Silent)
 }
 
-fn ask(session: &mut Session<'_>, number: u8) -> Result<Answers, Error> {
+/// Its answers, once it has done with the data that it got, if it got any.
+fn ask(session: &mut Session<'_>, number: u8, wrote: bool) -> Result<Answers, Error> {
     let running = DeviceType(session.read_number(Address::new(program::DEVICE_TYPE, 0))?);
+    if wrote && running.is_bootloader() {
+        // Without an answer, it is asked all the same.
+        let _ = session.await_idle(number, Doing::Program);
+    }
     let mut object = |index| reported(session.read_number(Address::new(index, number)));
     let control = object(program::PROGRAM_CONTROL)?;
     let crc = object(program::PROGRAM_ID)?;
@@ -114,7 +126,6 @@ mod tests {
     use super::super::event::Phase;
     use super::super::running::Known;
     use super::*;
-    use crate::device::Doing;
     use crate::update::options::FlashOptions;
 
     /// A program that runs is the new one if the device says so and had another CRC before; otherwise the old one.

@@ -195,7 +195,6 @@ fn word(said: &str) -> &'static str {
         ("had it before", "had"),
         ("Has its program", "had"),
         (",had,", "had"),
-        ("done in", "updated"),
         (": updated: node", "updated"),
         ("Updated", "updated"),
         (",updated,", "updated"),
@@ -209,6 +208,9 @@ fn word(said: &str) -> &'static str {
             end = place + words.len();
             verdicts.push(*verdict);
         }
+    }
+    if verdicts.is_empty() && said.contains("done in") {
+        verdicts.push("updated");
     }
     verdicts.dedup();
     assert_eq!(verdicts.len(), 1, "one verdict and no other: {verdicts:?} in {said}");

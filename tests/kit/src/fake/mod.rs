@@ -502,7 +502,7 @@ impl Fake {
             (0x1F51, 0) => Ok(vec![1]),
             (0x1F51, sub) if sub == self.program => Ok(vec![u8::from(self.running == Some(APPLICATION))]),
             (0x1F56, sub) if sub == self.program => {
-                let last = self.blocks.last().filter(|block| block[0] == 0xFF);
+                let last = self.blocks.last().filter(|block| block[0] == 0xFF && !self.busy());
                 let crc = last.map_or(0, |block| u32::from_le_bytes(block[16..20].try_into().unwrap()));
                 let application = self.crc_of_application.filter(|_| self.running == Some(APPLICATION));
                 let had = self.had.map(|(crc, _)| crc);

@@ -804,6 +804,24 @@ fn cancelling_aborts_the_transfer() {
     }
 }
 
+/// A device that has all data when the update is cancelled still completes its program.
+#[test]
+fn what_is_complete_soon_after_a_cancel_is_complete() {
+    let mut fake = Fake::new(BOOTLOADER);
+    let flag = Arc::new(AtomicBool::new(false));
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    session.cancel_by(flag.clone());
+    let mut events = Vec::new();
+    let result = flash(&mut session, file(), &FlashOptions::default(), &mut |event| {
+        if matches!(event, Event::Progress { done, total } if done == total) {
+            flag.store(true, Ordering::Relaxed);
+        }
+        events.push(event);
+    });
+    assert_eq!(result.unwrap_err().number(), 0x6000_0011);
+    assert_eq!(left(&events), DeviceState::Unreleased);
+}
+
 #[test]
 fn an_adapter_that_goes_away_ends_it_at_any_frame() {
     let mut fake = Fake::new(APPLICATION);
