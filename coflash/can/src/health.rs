@@ -90,7 +90,7 @@ impl fmt::Display for Losses {
         let all = [
             (restarts, format!("has restarted {}, and its bus was opened again", times(restarts))),
             (refused, format!("has refused {} (sent again)", frames(refused))),
-            (lost, format!("has lost or not answered {}", frames(lost))),
+            (lost, format!("has lost frames, or not answered one, {}", times(lost))),
         ];
         let all: Vec<String> =
             all.into_iter().filter(|(count, _)| *count > 0).map(|(_, words)| words).collect();
@@ -340,7 +340,10 @@ mod tests {
         // CRTL: RX_OVERFLOW 01h, TX_OVERFLOW 02h.
         let lost =
             after(&[(0x04, at(1, 0x01)), (0x04, at(1, 0x02)), (0x04, at(1, 0x40)), (0x02, at(1, 0x01))]);
-        assert_eq!(lost.disturbance().as_deref(), Some("the adapter has lost or not answered 2 frames"));
+        assert_eq!(
+            lost.disturbance().as_deref(),
+            Some("the adapter has lost frames, or not answered one, 2 times")
+        );
         // Data shorter than those of a driver.
         let mut health = Health::default();
         health.error_frame(0xFFFF_FFFF, &[]);

@@ -90,7 +90,8 @@ pub struct Args {
     #[arg(long)]
     pub stand_in: bool,
 
-    /// The stand-in refuses each command to leave, as an application does whose machine moves
+    /// The stand-in refuses each command to leave, as an application does whose machine moves.
+    /// Includes --stand-in
     #[arg(long)]
     pub refuse: bool,
 

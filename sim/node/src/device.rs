@@ -282,8 +282,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         match choice.exit {
             Exit::Again | Exit::Choose => unreachable!("its bootloader is whole, and it is not sealed"),
             Exit::Bootloader { stay, crash_resets, renewal, .. } => {
-                let report = woken.report(stay, crash_resets, renewal);
-                let reason = stay.reason;
+                let (reason, report) = (stay.reason, woken.report(stay, crash_resets, renewal));
                 let device = Bootloader::new(
                     config,
                     serial_number,
@@ -320,8 +319,6 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                             fresh: matches!(request, Some(BootRequest::Fresh(_))),
                             ..Start::new(None, defaults)
                         };
-                        // A lift's bootloader is another node.
-                        let hands_over = config.node_id.is_none();
                         let hosted = self.command.map(|command| {
                             let place = Place { serial_number, node_id: node.id_or_none(), program: number };
                             let program = contents(&flash, &journal, config, number);
@@ -329,11 +326,13 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                             let process = Process::start(command, &file, &program, place);
                             Hosted { number, process, leaving: None }
                         });
+                        // A lift's bootloader is another node.
+                        let hands_over = config.node_id.is_none();
                         let mut device =
                             StandIn::new(entries, identity, &start, hands_over, flash, config.layout);
                         device.refuses = refuses;
-                        let address = device.lss_address();
-                        let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
+                        let heartbeat = config.device.heartbeat_ms;
+                        let slave = slave(device.lss_address(), node, heartbeat, NmtPolicy::Follow);
                         Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer, hosted)
                     }
                 };

@@ -143,8 +143,8 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         },
         password: profile.password,
     }));
-    let stand_in: Option<&'static [Entry]> =
-        (args.stand_in || args.run.is_some()).then(|| &*Vec::leak(StandIn::entries(programs as u8)));
+    let stand_in: Option<&'static [Entry]> = (args.stand_in || args.refuse || args.run.is_some())
+        .then(|| &*Vec::leak(StandIn::entries(programs as u8)));
     let setup = |n: u8| -> Option<Setup> {
         let id = match args.unconfigured {
             true => None,
