@@ -45,12 +45,12 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!((said.out.as_str(), fake.writes().len()), ("node 5: the bootloader is running already\n", 0));
 
     // The application is called back before its program is erased.
-    let slow = || {
+    let erases = || {
         let mut fake = quick(APPLICATION);
-        fake.erase_time = Duration::from_millis(150);
+        fake.had = Some((0x0BAD_CAFE, 1));
         fake
     };
-    let (said, json, fake) = on(slow, &["erase"]);
+    let (said, json, fake) = on(erases, &["erase"]);
     assert!(said.out.starts_with("node 5: program 1 is erased, in "), "{}", said.out);
     assert!(json["seconds"].is_number());
     assert_eq!(fake.writes(), ["command 80", "command 03"]);
