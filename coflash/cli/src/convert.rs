@@ -324,7 +324,7 @@ impl Labels {
 }
 
 /// Whether two names refer to one file, as far as this can be determined.
-fn same_file(one: &Path, other: &Path) -> bool {
+pub(super) fn same_file(one: &Path, other: &Path) -> bool {
     let canonical = |path: &Path| path.canonicalize().ok();
     one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))
 }

@@ -21,6 +21,7 @@ use seal::wire::CERTIFICATE;
 use serde_json::{json, Value};
 
 use super::context::Context;
+use super::convert::same_file;
 use super::device::{asked, cancelled, Patience};
 use super::file::front;
 use super::many::{begin, write_report, Board};
@@ -82,10 +83,10 @@ impl MakePackage {
             .map_err(|fault| Failure::package(path, &fault))?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("cpk"));
         let advice = "name the package with --output";
-        if is_same(&output, path) {
+        if same_file(&output, path) {
             return Err(Failure::usage("the package would replace its recipe", advice));
         }
-        if recipe.programs.iter().any(|row| is_same(&output, &row.image)) {
+        if recipe.programs.iter().any(|row| same_file(&output, &row.image)) {
             return Err(Failure::usage("the package would replace an image of its recipe", advice));
         }
         output_file::write(&output, &bytes)?;
@@ -100,12 +101,6 @@ pub(super) fn read_recipe(path: &Path) -> Result<Recipe, Failure> {
     let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
     let folder = path.parent().unwrap_or(Path::new(""));
     Recipe::parse(&text, folder).map_err(|fault| Failure::recipe(path, &fault))
-}
-
-/// Whether two paths lead to one file, which there is.
-fn is_same(one: &Path, other: &Path) -> bool {
-    let real = |path: &Path| path.canonicalize().ok();
-    real(one).is_some_and(|one| real(other) == Some(one))
 }
 
 /// Whether a file is one for a machine.

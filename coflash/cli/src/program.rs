@@ -3,7 +3,7 @@
 
 use canopen::program::ProgramState;
 use clap::Args;
-use coflash_core::device::info::{program_info, ProgramInfo};
+use coflash_core::device::info::program_info;
 use coflash_core::device::Session;
 use coflash_core::update::event::{Event, Phase};
 use coflash_core::update::steps::{self, call_back, enter_bootloader, erase_at_once, reset_status};
@@ -157,7 +157,7 @@ impl Status {
                 "crc": info.crc,
                 "status": json!(info)["status"],
             });
-            Ok((format!("{running}\n{}", info_words(&info)), value))
+            Ok((format!("{running}\n{}", info.to_string().trim_end()), value))
         })
     }
 }
@@ -167,8 +167,4 @@ impl Status {
 fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
     let info = program_info(session, number)?;
     Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))
-}
-
-fn info_words(info: &ProgramInfo) -> String {
-    info.to_string().trim_end().to_string()
 }

@@ -112,11 +112,8 @@ const AT_ONCE: Duration = Duration::from_secs(2);
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Bytes(Vec<u8>);
 
-/// The result of a subcommand.
-struct Done {
-    words: String,
-    value: Value,
-}
+/// The result of a subcommand: for people, and for programs.
+type Done = (String, Value);
 
 impl Debug {
     pub(crate) fn run(&self, context: &Context) -> Result<(), Failure> {
@@ -127,8 +124,7 @@ impl Debug {
         let mut session = self.device.session(&mut link)?;
         let node = session.node();
         let outcome = self.command.run(&mut Debugger::new(&mut session));
-        let Done { words, mut value } =
-            outcome.map_err(|failure| Failure::diagnosed(failure, &mut session))?;
+        let (words, mut value) = outcome.map_err(|failure| Failure::diagnosed(failure, &mut session))?;
         value["node"] = node.get().into();
         context.result(format_args!("node {node}: {words}"), || value);
         Ok(())
@@ -146,7 +142,7 @@ impl Command {
                 debugger.resume()?;
                 match wait.wait {
                     Some(time) => stop(debugger, time),
-                    None => Ok(Done { words: "the program continues".to_string(), value: json!({}) }),
+                    None => Ok(("the program continues".to_string(), json!({}))),
                 }
             }
             Self::Step => {
@@ -165,7 +161,7 @@ impl Command {
                     named.clone().map(|(name, value)| format!("{name} {value:08X}h")).collect();
                 let value: serde_json::Map<String, Value> =
                     named.map(|(name, value)| ((*name).to_string(), value.into())).collect();
-                Ok(Done { words: words.join(", "), value: json!({ "registers": value }) })
+                Ok((words.join(", "), json!({ "registers": value })))
             }
         }
     }
@@ -199,10 +195,7 @@ fn stop(debugger: &mut Debugger<'_, '_>, time: Duration) -> Result<Done, Failure
             return Err(Failure::usage(what, advice));
         }
     };
-    Ok(Done {
-        words: format!("{words} {address:08X}h"),
-        value: json!({ "stopped": kind, "address": address }),
-    })
+    Ok((format!("{words} {address:08X}h"), json!({ "stopped": kind, "address": address })))
 }
 
 impl Read {
@@ -213,12 +206,9 @@ impl Read {
             output_file::write(path, &bytes)?;
             let words = format!("{len} bytes from {address:08X}h to {}", path.display());
             let value = json!({ "address": address, "size": len, "file": path.display().to_string() });
-            return Ok(Done { words, value });
+            return Ok((words, value));
         }
-        Ok(Done {
-            words: dump(address, &bytes),
-            value: json!({ "address": address, "size": len, "hex": hex(&bytes, "") }),
-        })
+        Ok((dump(address, &bytes), json!({ "address": address, "size": len, "hex": hex(&bytes, "") })))
     }
 }
 
@@ -235,10 +225,8 @@ impl Write {
             return Err(Failure::usage("there are no bytes to write", "give a word, --bytes or --input"));
         }
         debugger.write(self.address, &bytes, &mut |_| {})?;
-        Ok(Done {
-            words: format!("{} bytes written to {:08X}h", bytes.len(), self.address),
-            value: json!({ "address": self.address, "size": bytes.len() }),
-        })
+        let words = format!("{} bytes written to {:08X}h", bytes.len(), self.address);
+        Ok((words, json!({ "address": self.address, "size": bytes.len() })))
     }
 }
 
@@ -266,7 +254,7 @@ impl Break {
             [] => "no breakpoints".to_string(),
             _ => format!("breakpoints at {}", listed.join(", ")),
         };
-        Ok(Done { words, value: json!({ "breakpoints": set }) })
+        Ok((words, json!({ "breakpoints": set })))
     }
 }
 
