@@ -3,7 +3,7 @@
 use kit::folder::Folder;
 use kit::hawkbit::{Action, File, Server};
 
-use crate::tool::folder;
+use crate::tool::{command, folder, run, Done};
 
 /// The controller-ID of the device.
 const ID: &str = "door";
@@ -12,17 +12,10 @@ const ID: &str = "door";
 /// no server.
 const PROXIES: [&str; 3] = ["http_proxy", "https_proxy", "ALL_PROXY"];
 
-/// The command, as people run it: exit code, standard output and standard error.
-fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String) {
-    let output = crate::tool::command()
-        .args(arguments)
-        .current_dir(folder)
-        .env("TOKEN_OF_THE_DOOR", "t-door")
-        .envs(PROXIES.map(|name| (name, "http://127.0.0.1:9/")))
-        .output()
-        .unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.code(), text(&output.stdout), text(&output.stderr))
+/// The command, as people run it.
+fn call(folder: &Folder, arguments: &[&str]) -> Done {
+    let proxies = PROXIES.map(|name| (name, "http://127.0.0.1:9/"));
+    run(command().args(arguments).current_dir(folder).env("TOKEN_OF_THE_DOOR", "t-door").envs(proxies))
 }
 
 #[test]
@@ -35,8 +28,9 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     server.state().targets.get_mut(ID).unwrap().wants_attributes = false;
     let common = ["agent", "--once", "--bus", "socketcand://127.0.0.1:1/can0", "--hawkbit", &server.url];
     let log = ["--log-file", "log.txt", "--json-events"];
-    let (exit, out, err) = command(&folder, &[&common[..], &log].concat());
-    assert_eq!(exit, Some(8), "{out}{err}");
+    let done = call(&folder, &[&common[..], &log].concat());
+    done.fails(8, &[]);
+    let Done { out, err, .. } = done;
     let lines: Vec<serde_json::Value> =
         out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect();
     assert!(lines.iter().any(|line| line["event"] == "failed" && line["controller"] == ID), "{out}");
@@ -46,13 +40,11 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     assert!(log.contains("readme.txt"), "{log}");
     assert!(![&out, &err, &log].iter().any(|text| text.contains("t-door")), "{out}{err}{log}");
     // Nothing to do is a success; a server that is not there is none.
-    let (exit, out, err) = command(&folder, &common);
-    assert_eq!((exit, out.contains("0 updated, 0 failed, 0 not served")), (Some(0), true), "{out}{err}");
+    call(&folder, &common).says(&["0 updated, 0 failed, 0 not served"]);
 
     let wrong = |arguments: &[&str], words: &str| {
-        let (exit, out, err) = command(&folder, &[&["agent", "--once"], arguments].concat());
-        assert!(exit.is_some_and(|exit| exit != 0), "{out}");
-        assert!(err.contains(words), "{arguments:?}: {err}");
+        let Done { exit, out, err, .. } = call(&folder, &[&["agent", "--once"], arguments].concat());
+        assert!(exit != 0 && err.contains(words), "{arguments:?}: {out}{err}");
     };
     let bus = ["--bus", "socketcan:can0"];
     wrong(&["--devices", "none.toml"], "none.toml");
@@ -66,8 +58,7 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     let proxy = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let text = format!("proxy = 'http://{}'\nplain-http = true\n{door}", proxy.local_addr().unwrap());
     std::fs::write(folder.join("agent.toml"), text).unwrap();
-    let (exit, out, err) = command(&folder, &common);
-    assert_eq!((exit, out.contains("0 updated, 0 failed, 0 not served")), (Some(0), true), "{out}{err}");
+    call(&folder, &common).says(&["0 updated, 0 failed, 0 not served"]);
     let asked = std::thread::spawn(move || {
         let mut line = String::new();
         let mut reader = std::io::BufReader::new(proxy.accept().unwrap().0);

@@ -7,7 +7,8 @@ use kit::folder::Folder;
 use shared_abi::layout::nucleo_f446re::LAYOUT;
 use shared_abi::layout::toml::Toml;
 
-use crate::tool::{coflash, data, folder, typed, Done};
+use crate::sealing;
+use crate::tool::{coflash, data, folder, Done};
 use kit::fake::{serve, Fake, APPLICATION};
 
 /// The commands with `--board`, as the manual pages name them: these are made of the definition of the
@@ -34,15 +35,8 @@ struct Room {
 
 impl Room {
     fn new(name: &str) -> Self {
-        let folder = folder(name);
-        for role in ["root", "release"] {
-            let out = folder.path(&format!("{role}.pem"));
-            typed(&format!("seal keys new --role {role} -o {out}")).good();
-        }
+        let folder = sealing::Room::new(name).0;
         let path = |name: &str| folder.path(name);
-        let (root, key, cert) = (path("root.pem"), path("release.pub"), path("release.cert"));
-        let rights = "--epoch 1 --vendor 0x3F";
-        typed(&format!("seal keys certify --root {root} --key {key} {rights} -o {cert}")).good();
         // A resident part that knows sealed images (`MARK_OFFSET`).
         let mut resident = vec![0x5A; 992];
         resident[0x1C..0x20].copy_from_slice(b"CBS1");

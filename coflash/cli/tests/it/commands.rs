@@ -6,24 +6,18 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::several::unconfigured;
-use crate::tool::{coflash, data, folder, quick, run, snapshot};
+use crate::tool::{coflash, command, data, device, folder, quick, run, served, snapshot, Done};
 use canopen::{CobId, Frame};
 use coboot_can::candump::Line;
 use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 /// Runs a command on a device; returns its output as text and as JSON, and the device.
-fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (crate::tool::Done, Value, Fake) {
-    let go = |json: &[&str]| {
-        let (bus, server) = serve(fake());
-        let done = coflash(&[arguments, &["--bus", &bus, "-N", "5"], json].concat());
-        (done, server.join().unwrap())
-    };
-    let (words, _) = go(&[]);
-    let (json, fake) = go(&["--json"]);
+fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (Done, Value, Fake) {
+    let (words, _) = served(fake(), &[arguments, &["-N", "5"]].concat());
+    let (json, fake) = served(fake(), &[arguments, &["-N", "5", "--json"]].concat());
     assert_eq!(words.exit, json.exit, "{}{}", words.err, json.out);
-    let value = serde_json::from_str(&json.out).unwrap_or_else(|error| panic!("{error}: {}", json.out));
-    (words, value, fake)
+    (words, json.json(), fake)
 }
 
 /// The commit as git says it, from the folder of the sources.
@@ -45,11 +39,7 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!((said.out.as_str(), fake.writes().len()), ("node 5: the bootloader is running already\n", 0));
 
     // The application is called back before its program is erased.
-    let erases = || {
-        let mut fake = quick(APPLICATION);
-        fake.had = Some((0x0BAD_CAFE, 1));
-        fake
-    };
+    let erases = || device(APPLICATION, |fake| fake.had = Some((0x0BAD_CAFE, 1)));
     let (said, json, fake) = on(erases, &["erase"]);
     assert!(said.out.starts_with("node 5: program 1 is erased, in "), "{}", said.out);
     assert!(json["seconds"].is_number());
@@ -71,20 +61,23 @@ fn the_steps_of_an_update_one_by_one() {
 
 #[test]
 fn a_step_that_fails_has_the_words_and_numbers_of_the_manual() {
-    let refusing = |command, outcome| {
-        move || {
-            let mut fake = quick(BOOTLOADER);
-            fake.on_command = Box::new(move |came| if came == command { outcome } else { Outcome::Accept });
-            fake
-        }
-    };
-    let (said, json, _) = on(refusing(0x83, Outcome::Status(0x10)), &["more", "release"]);
-    assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000110".into()));
-    assert!(said.err.starts_with("error: releasing the program for autostart failed: "), "{}", said.err);
-    let (said, json, _) = on(refusing(0x84, Outcome::AbortStatus(0x0800_0022, 0x84)), &["more", "withdraw"]);
-    assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
-    let (said, json, _) = on(refusing(0x01, Outcome::AbortStatus(0x0800_0022, 2)), &["start"]);
-    assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));
+    for (command, outcome, words, exit, number, begin) in [
+        (
+            0x83,
+            Outcome::Status(0x10),
+            &["more", "release"][..],
+            6,
+            "0x60000110",
+            "error: releasing the program for autostart failed: ",
+        ),
+        (0x84, Outcome::AbortStatus(0x0800_0022, 0x84), &["more", "withdraw"], 6, "0x60000184", ""),
+        (0x01, Outcome::AbortStatus(0x0800_0022, 2), &["start"], 7, "0x60000014", ""),
+    ] {
+        let judge = move |came| if came == command { outcome } else { Outcome::Accept };
+        let (said, json, _) = on(|| device(BOOTLOADER, |fake| fake.on_command = Box::new(judge)), words);
+        assert_eq!((said.exit, &json["error"]["number"]), (exit, &number.into()), "{words:?}");
+        assert!(said.err.starts_with(begin), "{}", said.err);
+    }
 }
 
 /// The words of 2007h in the message of a start that failed: of a device without a program after
@@ -100,13 +93,8 @@ fn a_start_that_fails_is_told_with_the_device_s_reason() {
             "does not feed its watchdog",
         ),
     ] {
-        let stays = || {
-            let mut fake = quick(BOOTLOADER);
-            fake.starts = Some(BOOTLOADER);
-            fake.state = Some(state);
-            fake
-        };
-        let (said, json, _) = on(stays, &["start", "--boot-timeout", "300"]);
+        let stays = |fake: &mut Fake| (fake.starts, fake.state) = (Some(BOOTLOADER), Some(state));
+        let (said, json, _) = on(|| device(BOOTLOADER, stays), &["start", "--boot-timeout", "300"]);
         assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));
         assert!(said.err.contains(words) && said.err.contains(advice), "{}", said.err);
     }
@@ -115,39 +103,29 @@ fn a_start_that_fails_is_told_with_the_device_s_reason() {
 /// 2007h/6 and 7 in words, with what to do. 0FFFAAEDh is the factory's value (RM0090 section 3.9.10).
 #[test]
 fn info_says_what_is_wrong_with_option_bytes_and_supply() {
-    let with = |options, supply| {
-        move || {
-            let mut fake = quick(BOOTLOADER);
-            fake.state = Some([6, 1, 0]);
-            fake.chip = Some((options, supply));
-            fake
-        }
+    let info = |options, supply| {
+        let with = |fake: &mut Fake| (fake.state, fake.chip) = (Some([6, 1, 0]), Some((options, supply)));
+        on(|| device(BOOTLOADER, with), &["info"])
     };
-    let (said, json, _) = on(with(0x0FFF_AAED, 2), &["info"]);
-    for words in [
+    let (said, json, _) = info(0x0FFF_AAED, 2);
+    said.says(&[
         "  supply            too low to write its flash\n",
         "  option bytes      brown-out reset off, no sector protected, read-out protection level 0 (0FFFAAEDh)\n",
         "    warning         the brown-out reset is off",
         "    warning         the bootloader is not write-protected",
-    ] {
-        assert!(said.out.contains(words), "{words:?}: {}", said.out);
-    }
+    ]);
     assert_eq!((&json["state"]["option_bytes"], &json["state"]["supply"]), (&0x0FFF_AAED.into(), &2.into()));
-    let (said, ..) = on(with(0x0FFE_AAE1, 1), &["info"]);
+    let (said, ..) = info(0x0FFE_AAE1, 1);
     assert!(said.out.contains("  supply            good\n") && !said.out.contains("warning"), "{}", said.out);
     // A device without a chip, or that does not watch its supply, has neither.
-    let (said, ..) = on(with(0, 0), &["info"]);
+    let (said, ..) = info(0, 0);
     assert!(!said.out.contains("supply") && !said.out.contains("option bytes"), "{}", said.out);
 }
 
 /// 1F57h is 84h with 1 in its upper half: the supply is too low (docs/protocol.md).
 #[test]
 fn a_supply_that_is_too_low_is_named_with_the_cure() {
-    let low = || {
-        let mut fake = quick(BOOTLOADER);
-        fake.on_command = Box::new(|_| Outcome::Status(0x0001_0084));
-        fake
-    };
+    let low = || device(BOOTLOADER, |fake| fake.on_command = Box::new(|_| Outcome::Status(0x0001_0084)));
     let (said, json, _) = on(low, &["more", "release"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
     assert!(said.err.contains("the supply of the device is too low to write its flash"), "{}", said.err);
@@ -156,11 +134,7 @@ fn a_supply_that_is_too_low_is_named_with_the_cure() {
 
 #[test]
 fn status_shows_and_clears() {
-    let failed = || {
-        let mut fake = quick(BOOTLOADER);
-        fake.status(0x0000_000C);
-        fake
-    };
+    let failed = || device(BOOTLOADER, |fake| fake.status(0x0000_000C));
     let (said, json, _) = on(failed, &["more", "status"]);
     snapshot("status", &said.out);
     assert_eq!((&json["status"]["error"], &json["bootloader"]), (&0x0C.into(), &true.into()));
@@ -177,15 +151,7 @@ fn debug_knows_its_device_wherever_it_is_named() {
         let mut words = words.to_vec();
         let option: Vec<&str> = words.drain(5..).collect();
         words.splice(place..place, option);
-        let (bus, server) = serve(quick(APPLICATION));
-        let done = coflash(&[&["--bus", &bus], &words[..]].concat());
-        assert_eq!(done.exit, 6, "{words:?}: {}", done.err);
-        assert!(
-            done.err.contains("node 5 refuses") && done.err.contains("no debugger interface"),
-            "{}",
-            done.err
-        );
-        server.join().unwrap();
+        served(quick(APPLICATION), &words).0.fails(6, &["node 5 refuses", "no debugger interface"]);
     }
 }
 
@@ -204,18 +170,13 @@ fn read_shows_values_as_what_they_are() {
     assert_eq!((&json["number"], &json["hex"]), (&1234.into(), &"D2040000".into()));
     // Longer than four bytes, with and without blocks.
     for knows in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
-        let fake = move || {
-            let mut fake = quick(APPLICATION);
-            fake.knows_blocks = knows;
-            fake
-        };
+        let fake = || device(APPLICATION, |fake| fake.knows_blocks = knows);
         let (said, json, _) = on(fake, &["read", "1008"]);
         assert_eq!(said.out, "node 5, 1008h/0: \"a device with a long name\"\n");
         assert_eq!(json["text"], "a device with a long name");
     }
     let folder = folder("read");
-    let (said, _, _) = on(|| quick(APPLICATION), &["read", "100A", "-o", &folder.path("version")]);
-    assert_eq!(said.exit, 0, "{}", said.err);
+    on(|| quick(APPLICATION), &["read", "100A", "-o", &folder.path("version")]).0.good();
     assert_eq!(fs::read(folder.path("version")).unwrap(), b"v1\x1B\0junk");
     let (said, json, _) = on(|| quick(APPLICATION), &["read", "2000/1"]);
     assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000025".into()));
@@ -228,12 +189,9 @@ fn a_program_is_read_back_where_the_device_allows_it() {
     // Each value of a byte, and an end inside a segment of 7.
     let program: Vec<u8> = (0..=513_u32).map(|i| (i ^ i >> 8) as u8).collect();
     for knows in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
-        let fake = || {
-            let mut fake = quick(BOOTLOADER);
-            (fake.readable, fake.knows_blocks) = (Some(program.clone()), knows);
-            fake
-        };
-        let (said, json, _) = on(fake, &["read", "1F50/1", "-o", &folder.path("back.bin")]);
+        let fake = |fake: &mut Fake| (fake.readable, fake.knows_blocks) = (Some(program.clone()), knows);
+        let words = ["read", "1F50/1", "-o", &folder.path("back.bin")];
+        let (said, json, _) = on(|| device(BOOTLOADER, fake), &words);
         assert!(said.out.starts_with("node 5, 1F50h/1: 514 bytes to "), "{}{}", said.out, said.err);
         assert_eq!((&json["size"], &json["hex"]), (&514.into(), &Value::Null));
         assert!(fs::read(folder.path("back.bin")).unwrap() == program);
@@ -278,22 +236,19 @@ fn reset_waits_for_the_boot_up() {
     let (said, json, fake) = on(|| quick(APPLICATION), &["reset"]);
     assert_eq!(said.out, "back on the bus: node 5\n");
     assert_eq!((&json["booted"], fake.log.last().unwrap().as_str()), (&serde_json::json!([5]), "nmt 81"));
-    let (bus, server) = serve(quick(APPLICATION));
-    let done = coflash(&["reset", "--all", "--communication", "--bus", &bus, "--boot-timeout", "700"]);
+    let words = ["reset", "--all", "--communication", "--boot-timeout", "700"];
+    let (done, fake) = served(quick(APPLICATION), &words);
     assert_eq!((done.exit, done.out.as_str()), (0, "back on the bus: node 5\n"));
-    assert_eq!(server.join().unwrap().log, ["nmt 82"]);
+    assert_eq!(fake.log, ["nmt 82"]);
     // A node that is not there.
-    let (bus, server) = serve(quick(APPLICATION));
-    coflash(&["reset", "-N", "6", "--bus", &bus, "--boot-timeout", "50"])
-        .fails(5, &["node 6 has sent no boot-up message"]);
-    server.join().unwrap();
+    let (done, _) = served(quick(APPLICATION), &["reset", "-N", "6", "--boot-timeout", "50"]);
+    done.fails(5, &["node 6 has sent no boot-up message"]);
 }
 
 #[test]
 fn scan_finds_who_answers_and_who_is_heard() {
     let devices = || {
-        let mut bootloader = quick(BOOTLOADER);
-        bootloader.node = 9;
+        let mut bootloader = quick(BOOTLOADER).at(9, 1);
         bootloader.status(0x02);
         let mut application = quick(APPLICATION);
         // Node 20 has no SDO server, or its SDO server uses other COB-IDs.
@@ -302,52 +257,44 @@ fn scan_finds_who_answers_and_who_is_heard() {
         Bus(vec![application, bootloader])
     };
     let scan = |options: &[&str]| {
-        let (bus, server) = serve(devices());
-        let done = coflash(
-            &[&["scan", "--bus", &bus, "--listen", "50", "--sdo-timeout", "500"][..], options].concat(),
-        )
-        .good();
-        (done.out, server.join().unwrap())
+        let words = ["scan", "--listen", "50", "--sdo-timeout", "500"];
+        let (done, bus) = served(devices(), &[&words[..], options].concat());
+        (done.good(), bus)
     };
-    snapshot("scan", &scan(&[]).0);
-    let json: Value = serde_json::from_str(&scan(&["--json"]).0).unwrap();
+    snapshot("scan", &scan(&[]).0.out);
+    let json = scan(&["--json"]).0.json();
     let nodes: Vec<&Value> = json["nodes"].as_array().unwrap().iter().map(|node| &node["node"]).collect();
     assert_eq!(nodes, [5, 9, 20]);
     assert_eq!(
         (&json["nodes"][1]["info"]["bootloader"], &json["nodes"][2]["answers"]),
         (&true.into(), &false.into())
     );
-    let (out, bus) = scan(&["--listen-only"]);
-    assert!(out.contains("no answer") && bus.0.iter().all(|fake| fake.sent.is_empty()), "{out}");
-    let (out, _) = scan(&["-N", "9,11-12"]);
-    assert!(out.contains("\n9     bootloader"), "{out}");
+    let (done, bus) = scan(&["--listen-only"]);
+    done.says(&["no answer"]);
+    assert!(bus.0.iter().all(|fake| fake.sent.is_empty()));
+    scan(&["-N", "9,11-12"]).0.says(&["\n9     bootloader"]);
     // An unfinished transfer of another tool is aborted first: within a block download, a request
     // can be taken for a segment.
     let folder = folder("scan");
     let trace = folder.path("scan.log");
     scan(&["-N", "9", "--trace", &trace]);
-    let text = fs::read_to_string(&trace).unwrap();
-    let frames: Vec<String> =
-        text.lines().map(|line| Line::parse(line).unwrap().unwrap().frame.to_string()).collect();
-    assert_eq!(frames[..2], ["609#8000100000000008", "609#4000100000000000"]);
-    let (bus, server) = serve(Bus(vec![]));
-    let done = coflash(&["scan", "--bus", &bus, "--listen", "10", "--sdo-timeout", "10"]);
+    assert_eq!(frames(&trace)[..2], ["609#8000100000000008", "609#4000100000000000"]);
+    let (done, _) = served(Bus(vec![]), &["scan", "--listen", "10", "--sdo-timeout", "10"]);
     assert!(done.exit == 0 && done.out.starts_with("no node answers, and no node was heard"), "{}", done.out);
-    server.join().unwrap();
+}
+
+/// The frames of a trace.
+fn frames(trace: &str) -> Vec<String> {
+    let text = fs::read_to_string(trace).unwrap();
+    text.lines().map(|line| Line::parse(line).unwrap().unwrap().frame.to_string()).collect()
 }
 
 #[test]
 fn a_trace_is_shown_again_in_words() {
     let folder = folder("trace");
     let trace = folder.path("bus.log");
-    let (bus, server) = serve(quick(BOOTLOADER));
-
-    coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", &trace, "--segmented"]).good();
-    server.join().unwrap();
-    let text = fs::read_to_string(&trace).unwrap();
-    let frames: Vec<String> =
-        text.lines().map(|line| Line::parse(line).unwrap().unwrap().frame.to_string()).collect();
-    assert_eq!(frames, ["605#4018100200000000", "585#43181002D2040000"]);
+    served(quick(BOOTLOADER), &["read", "1018/2", "-N", "5", "--trace", &trace, "--segmented"]).0.good();
+    assert_eq!(frames(&trace), ["605#4018100200000000", "585#43181002D2040000"]);
     let done = coflash(&["monitor", "--replay", &trace]);
     let words: Vec<&str> = done.out.lines().map(|line| line.get(35..).unwrap_or(line)).collect();
     assert_eq!(
@@ -360,15 +307,13 @@ fn a_trace_is_shown_again_in_words() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_trace_that_cannot_be_written_is_a_warning() {
-    let (bus, server) = serve(quick(BOOTLOADER));
-    let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/dev/full"]);
+    let read = |trace| served(quick(BOOTLOADER), &["read", "1018/2", "-N", "5", "--trace", trace]);
+    let (done, _) = read("/dev/full");
     assert_eq!((done.exit, done.out.as_str()), (0, "node 5, 1018h/2: 1234 (000004D2h)\n"));
     assert!(done.err.starts_with("warning: /dev/full: writing failed: "), "{}", done.err);
-    server.join().unwrap();
-    let (bus, server) = serve(quick(BOOTLOADER));
-    coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", "/there/is/none"])
-        .fails(4, &["trace file /there/is/none cannot be opened"]);
-    assert!(server.join().unwrap().sent.is_empty());
+    let (done, fake) = read("/there/is/none");
+    done.fails(4, &["trace file /there/is/none cannot be opened"]);
+    assert!(fake.sent.is_empty());
 }
 
 #[test]
@@ -406,14 +351,10 @@ fn monitor_shows_a_log() {
 fn monitor_shows_the_bus() {
     let mut fake = quick(APPLICATION);
     fake.inject(Frame::of(CobId::new(0x705).unwrap(), &[0x7F]));
-    let (bus, server) = serve(fake);
-    let done = coflash(&["monitor", "--bus", &bus, "--count", "1", "--for", "20000"]);
+    let (done, _) = served(fake, &["monitor", "--count", "1", "--for", "20000"]);
     assert!(done.exit == 0 && done.out.ends_with("node 5: heartbeat, pre-operational\n"), "{}", done.out);
-    server.join().unwrap();
-    let (bus, server) = serve(quick(APPLICATION));
-    let done = coflash(&["monitor", "--bus", &bus, "--for", "20"]);
+    let (done, _) = served(quick(APPLICATION), &["monitor", "--for", "20"]);
     assert_eq!((done.exit, done.out.as_str()), (0, ""));
-    server.join().unwrap();
 }
 
 /// `coflash monitor | head`: it ends when standard output is closed.
@@ -451,11 +392,8 @@ impl coboot_can::Adapter for Heartbeats {
 
 #[test]
 fn lss_says_what_it_does() {
-    let lss = |options: &[&str]| {
-        let (bus, server) = serve(unconfigured());
-        let done = coflash(&[&["lss", "--bus", &bus, "--lss-timeout", "30"][..], options].concat());
-        (done, server.join().unwrap())
-    };
+    let lss =
+        |options: &[&str]| served(unconfigured(), &[&["lss", "--lss-timeout", "30"][..], options].concat());
     let (done, device) = lss(&["inquire"]);
     assert_eq!(
         done.out,
@@ -472,7 +410,7 @@ fn lss_says_what_it_does() {
     assert_eq!(done.out, "the device is given 250 kbit/s and switches to it after 500 ms\n");
     assert_eq!(device.orders, [[0x13, 0, 3], [0x15, 0xF4, 1]]);
     let (done, device) = lss(&["--json", "bit-rate", "1000", "--store"]);
-    let json: Value = serde_json::from_str(&done.out).unwrap();
+    let json = done.json();
     assert_eq!((&json["bit_rate"], &json["activated"]), (&1_000_000.into(), &false.into()));
     assert_eq!(device.orders, [[0x13, 0, 0], [0x17, 0, 0]]);
     let (done, device) = lss(&["store"]);
@@ -480,12 +418,8 @@ fn lss_says_what_it_does() {
     // A device that does not exist.
     let (done, device) =
         lss(&["assign", "-N", "9", "--vendor", "1", "--product", "2", "--revision", "3", "--serial", "4"]);
-    assert_eq!((done.exit, device.orders.len()), (5, 0));
-    assert!(
-        done.err.contains("no device answers (selecting the device by its LSS address) [0x60000013]"),
-        "{}",
-        done.err
-    );
+    assert_eq!(device.orders.len(), 0);
+    done.fails(5, &["no device answers (selecting the device by its LSS address) [0x60000013]"]);
     for (options, words) in [
         (&["assign", "-N", "9", "--vendor", "1"][..], "--product"),
         (&["assign"], "--node"),
@@ -496,19 +430,11 @@ fn lss_says_what_it_does() {
 }
 
 /// Runs the shell with these lines on its standard input.
-fn shell(arguments: &[&str], lines: &str) -> crate::tool::Done {
-    let mut child = crate::tool::command()
-        .args(["more", "shell"])
-        .args(arguments)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    child.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
-    let done = child.wait_with_output().unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    crate::tool::Done { exit: done.status.code().unwrap(), out: text(done.stdout), err: text(done.stderr) }
+fn shell(arguments: &[&str], lines: &str) -> Done {
+    let (input, mut typed) = std::io::pipe().unwrap();
+    typed.write_all(lines.as_bytes()).unwrap();
+    drop(typed);
+    run(command().args(["more", "shell"]).args(arguments).stdin(input))
 }
 
 #[test]
@@ -537,9 +463,8 @@ fn the_shell_runs_one_command_after_the_other() {
     ] {
         shell(&[], line).fails(2, &[words]);
     }
-    let done = shell(&["--json"], &format!("inspect {file}"));
-    assert_eq!(serde_json::from_str::<Value>(&done.out).unwrap()["bytes"], 803);
-    assert!(shell(&[], "help flash").out.contains("--check-target"));
+    assert_eq!(shell(&["--json"], &format!("inspect {file}")).json()["bytes"], 803);
+    shell(&[], "help flash").says(&["--check-target"]);
 }
 
 #[test]
@@ -550,11 +475,9 @@ fn completions_and_manual_pages_are_written() {
         ("fish", "complete -c coflash"),
         ("powershell", "Register-ArgumentCompleter"),
     ] {
-        let done = coflash(&["more", "completions", shell]);
-        assert!(done.exit == 0 && done.out.contains(words) && done.out.contains("check-target"), "{shell}");
+        coflash(&["more", "completions", shell]).says(&[words, "check-target"]);
     }
-    let done = coflash(&["more", "man"]);
-    assert!(done.exit == 0 && done.out.contains(".TH coflash"), "{}", done.out);
+    coflash(&["more", "man"]).says(&[".TH coflash"]);
     let folder = folder("man");
     coflash(&["more", "man", "--out", &folder.path("pages")]).good();
     let page = fs::read_to_string(folder.path("pages/coflash-flash.1")).unwrap();
@@ -604,8 +527,7 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     // The file in the current folder is used; the node of the command line takes precedence.
     let (bus, server) = serve(quick(BOOTLOADER));
     folder.file("coflash.toml", format!("bus = '{bus}'\nnode = 6\n").as_bytes());
-    let mut here = crate::tool::command();
-    let done = run(here.current_dir(&folder).args(["info", "--node", "5"]));
+    let done = run(command().current_dir(&folder).args(["info", "--node", "5"]));
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
     // In the shell, too; but not with --all, and it is not assigned as a node-ID.
@@ -614,10 +536,9 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     let done = shell(&["--bus", &bus, "--config", &config], "read 1018/2\n");
     assert!(done.out.starts_with("node 5, 1018h/2: 1234"), "{}{}", done.out, done.err);
     server.join().unwrap();
-    let (bus, server) = serve(quick(BOOTLOADER));
-
-    coflash(&["reset", "--all", "--bus", &bus, "--config", &config, "--boot-timeout", "300"]).good();
-    let fake = server.join().unwrap();
+    let words = ["reset", "--all", "--config", &config, "--boot-timeout", "300"];
+    let (done, fake) = served(quick(BOOTLOADER), &words);
+    done.good();
     assert_eq!(fake.sent[0].to_string(), "000#8100");
     coflash(&["lss", "assign", "--bus", "socketcand://127.0.0.1:1/x", "--config", &config])
         .fails(2, &["--node"]);
@@ -641,8 +562,7 @@ fn help_is_complete() {
     for command in
         [&["-h"][..], &["--help"], &["flash", "-h"], &["flash", "--help"], &["lss", "assign", "--help"]]
     {
-        let mut tool = crate::tool::command();
-        let done = run(tool.args(command).env_remove("SOURCE_DATE_EPOCH")).good();
+        let done = run(crate::tool::command().args(command).env_remove("SOURCE_DATE_EPOCH")).good();
         text.push_str(&done.out);
         text.push_str("\n----\n");
     }

@@ -16,7 +16,7 @@ use coboot_can::Cia309;
 use coflash_core::device::{Doing, Session, Timing};
 use coflash_core::Error;
 
-use crate::tool::{coflash, data, quick};
+use crate::tool::{coflash, data, device, quick, served, NOWHERE};
 use kit::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 /// The gateway's answer to a line, or none. The gateway adds `[7]` to the answer itself.
@@ -136,17 +136,13 @@ fn behind(fake: Fake) -> (String, Lines, Arc<Mutex<Behind>>) {
 fn block_files_go_through_a_gateway() {
     let file = data("identity-110.blk");
     for blocks in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
-        let mut fake = quick(APPLICATION);
-        fake.knows_blocks = blocks;
-        let (bus, lines, device) = behind(fake);
-        let options = ["--sdo-timeout", "50"];
-        let done = coflash(&[&["--bus", &bus, "flash", "-N", "5", &file][..], &options].concat());
-        assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
+        let (bus, lines, device) = behind(device(APPLICATION, |fake| fake.knows_blocks = blocks));
+        coflash(&["--bus", &bus, "flash", "-N", "5", &file, "--sdo-timeout", "50"]).good();
         let device = device.lock().unwrap();
         assert_eq!(device.fake.blocks.concat(), fs::read(&file).unwrap());
         assert_eq!(device.fake.running, Some(APPLICATION));
-        let log = device.fake.writes().into_iter().filter(|entry| entry.starts_with("command"));
-        let log: Vec<&str> = log.collect();
+        let mut log = device.fake.writes();
+        log.retain(|entry| entry.starts_with("command"));
         assert_eq!(log[0], "command 80", "{log:?}");
         assert_eq!(log[log.len() - 4..], ["command 01", "command 80", "command 83", "command 01"]);
         // By the standard: number, network, node, command, index, sub-index, type, value.
@@ -181,16 +177,19 @@ impl Maker for Standard {
     }
 }
 
+/// Such a device, and the image that it gets.
+fn standard() -> (Fake, Arc<Mutex<Vec<u8>>>) {
+    let image = Arc::default();
+    let maker = Box::new(Standard(Arc::clone(&image)));
+    (device(APPLICATION, |fake| fake.maker = Some(maker)), image)
+}
+
 #[test]
 fn images_go_through_a_gateway() {
-    let image = Arc::new(Mutex::new(Vec::new()));
-    let mut fake = quick(APPLICATION);
-    fake.maker = Some(Box::new(Standard(image.clone())));
+    let (fake, image) = standard();
     let (bus, _, _) = behind(fake);
-    let file = data("program.elf");
     let board = ["--board", "nucleo-f446re", "--dialect", "raw"];
-    let done = coflash(&[&["--bus", &bus, "flash", "-N", "5", &file][..], &board].concat());
-    assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
+    coflash(&[&["--bus", &bus, "flash", "-N", "5", &data("program.elf")][..], &board].concat()).good();
     assert!(*image.lock().unwrap() == fs::read(data("program.bin")).unwrap());
 }
 
@@ -198,26 +197,16 @@ fn images_go_through_a_gateway() {
 #[test]
 fn a_binary_without_an_address_goes_to_devices_that_have_none() {
     let file = data("identity-110.blk");
-    let (bus, server) = {
-        let image = Arc::new(Mutex::new(Vec::new()));
-        let mut fake = quick(APPLICATION);
-        fake.maker = Some(Box::new(Standard(image.clone())));
-        let (bus, server) = kit::fake::serve(fake);
-        (bus, (server, image))
-    };
-    let binary = ["flash", "-N", "5", &file, "-I", "binary"];
+    let binary = ["flash", "-N", "5", &file, "-I", "binary", "--dialect"];
     // This file is not a program, and is refused with a message.
-    let done =
-        coflash(&[&["--bus", "socketcand://127.0.0.1:1/x"][..], &binary, &["--dialect", "raw"]].concat());
-    done.fails(3, &["is not a program: its first word"]);
-    let done = coflash(&[&["--bus", &bus][..], &binary, &["--dialect", "raw", "--force"]].concat());
-    assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
-    server.0.join().unwrap();
-    assert!(*server.1.lock().unwrap() == fs::read(&file).unwrap());
+    let nowhere = |dialect| coflash(&[&["--bus", NOWHERE], &binary[..], &[dialect]].concat());
+    nowhere("raw").fails(3, &["is not a program: its first word"]);
+    let (fake, image) = standard();
+    served(fake, &[&binary[..], &["raw", "--force"]].concat()).0.good();
+    assert!(*image.lock().unwrap() == fs::read(&file).unwrap());
     // Blocks and Intel HEX have addresses.
     for dialect in ["block", "hex", "esacademy", "auto"] {
-        coflash(&[&["--bus", &bus][..], &binary, &["--dialect", dialect]].concat())
-            .fails(3, &["give --start-address or --board"]);
+        nowhere(dialect).fails(3, &["give --start-address or --board"]);
     }
 }
 
@@ -228,8 +217,7 @@ fn what_reads_and_writes_objects_works_through_a_gateway() {
     assert_eq!((done.exit, done.out.as_str()), (0, "node 5, 1008h/0: \"a device with a long name\"\n"));
     assert_eq!(*lines.lock().unwrap(), ["[1] 3 set sdo_timeout 700", "[2] 3 5 r 0x1008 0 d"]);
     let (bus, ..) = behind(quick(BOOTLOADER));
-    let done = coflash(&["--bus", &bus, "info", "-N", "5"]);
-    assert!(done.exit == 0 && done.out.contains("vendor-ID         0000003Fh"), "{}{}", done.out, done.err);
+    coflash(&["--bus", &bus, "info", "-N", "5"]).says(&["vendor-ID         0000003Fh"]);
     let (bus, _, device) = behind(quick(APPLICATION));
     coflash(&["--bus", &bus, "enter", "-N", "5"]).good();
     assert_eq!(device.lock().unwrap().fake.running, Some(BOOTLOADER));
@@ -246,18 +234,16 @@ fn what_reads_and_writes_objects_works_through_a_gateway() {
 
 #[test]
 fn what_the_device_refuses_has_the_same_words_as_on_the_bus() {
-    let mut fake = quick(BOOTLOADER);
-    fake.on_block = Box::new(|_| Outcome::AbortStatus(0x0800_0020, 0x0E));
-    let (bus, ..) = behind(fake);
+    let refuse = |fake: &mut Fake| fake.on_block = Box::new(|_| Outcome::AbortStatus(0x0800_0020, 0x0E));
+    let (bus, ..) = behind(device(BOOTLOADER, refuse));
     coflash(&["--bus", &bus, "flash", "-N", "5", &data("plain-400.blk")]).fails(6, &["[0x60000007]"]);
     let (bus, ..) = behind(quick(BOOTLOADER));
     coflash(&["--bus", &bus, "read", "-N", "5", "2000"])
         .fails(6, &["node 5 refuses reading 2000h/0: abort 06020000h"]);
     let (bus, ..) = behind(quick(BOOTLOADER));
-    let done = coflash(&["--bus", &bus, "read", "-N", "6", "1000"]);
-    done.fails(5, &["node 6 does not answer"]);
     // The bus was not observed.
-    assert!(done.err.contains("what to do: check that node 6 is the right one"), "{}", done.err);
+    coflash(&["--bus", &bus, "read", "-N", "6", "1000"])
+        .fails(5, &["node 6 does not answer", "what to do: check that node 6 is the right one"]);
 }
 
 /// Commands that need frames report that they do.
@@ -271,9 +257,7 @@ fn what_listens_to_the_bus_is_refused_in_words() {
     coflash(&["--bus", &bus, "flash", &file, "--ser_num", "1"]).fails(2, &["LSS address"]);
     // The gateway on the CAN bus of the manual's tool is a different one.
     for option in ["--gateway_id", "--network_id"] {
-        let done = coflash(&["--bus", &bus, "flash", &file, option, "3"]);
-        assert_eq!(done.exit, 2, "{}", done.err);
-        assert!(done.err.contains("CiA 302-7") && done.err.contains("cia309://"), "{}", done.err);
+        coflash(&["--bus", &bus, "flash", &file, option, "3"]).fails(2, &["CiA 302-7", "cia309://"]);
     }
     for (url, words) in [
         ("cia309:1.2.3.4", "it must be cia309://HOST:PORT/NET"),
@@ -302,16 +286,19 @@ fn asked(
     (result, gateway)
 }
 
-fn ask(gateway: &mut Cia309) -> Result<Vec<u8>, GatewayError> {
-    let ask = Ask {
+fn request(at: Address) -> Ask<'static> {
+    Ask {
         node: NodeId::new(5).unwrap(),
-        at: Address::new(0x1000, 0),
+        at,
         sdo: Duration::from_millis(100),
         patience: Duration::from_millis(300),
         longest: 4096,
         cancelled: &|| false,
-    };
-    gateway.upload(&ask, &mut |_| {})
+    }
+}
+
+fn ask(gateway: &mut Cia309) -> Result<Vec<u8>, GatewayError> {
+    gateway.upload(&request(Address::new(0x1000, 0)), &mut |_| {})
 }
 
 fn words(result: Result<Vec<u8>, GatewayError>) -> String {
@@ -503,14 +490,7 @@ fn a_gateway_that_goes_away_or_takes_nothing_ends_it() {
     let (mut stream, _) = listener.accept().unwrap();
     stream.write_all(b"[1] OK\r\n").unwrap();
     let image = vec![0x55; 24 << 20];
-    let ask = Ask {
-        node: NodeId::new(5).unwrap(),
-        at: Address::new(0x1F50, 1),
-        sdo: Duration::from_millis(100),
-        patience: Duration::from_millis(300),
-        longest: 4096,
-        cancelled: &|| false,
-    };
+    let ask = request(Address::new(0x1F50, 1));
     let result = gateway.download(&ask, &image, &mut |_| {}).map(|()| Vec::new());
     let found = words(result);
     assert!(found.contains("it has accepted no data for 0.3 s"), "{found}");

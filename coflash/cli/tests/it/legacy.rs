@@ -4,9 +4,9 @@ use std::fs;
 use std::net::TcpListener;
 
 use super::adapters::serve_slcan;
-use crate::tool::{coflash, data, folder, quick, run, typed, Done};
+use crate::tool::{coflash, command, data, device, folder, quick, run, served, Done, NOWHERE};
 use kit::fake::renewal::image;
-use kit::fake::{serve, Outcome, APPLICATION, BOOTLOADER};
+use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 /// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {
@@ -21,28 +21,9 @@ fn shown(number: u32) -> i32 {
 #[test]
 fn with_legacy_exit_codes_the_program_ends_with_the_manuals_numbers() {
     let file = data("plain-400.blk");
-    let status = |word| {
-        let mut fake = quick(BOOTLOADER);
-        fake.on_block = Box::new(move |_| Outcome::Status(word));
-        fake
-    };
-    let absent = || {
-        let mut fake = quick(BOOTLOADER);
-        fake.running = None;
-        fake
-    };
-    let dead = || {
-        let mut fake = quick(BOOTLOADER);
-        fake.starts = Some(BOOTLOADER);
-        fake
-    };
-    let wrong = || {
-        let mut fake = quick(BOOTLOADER);
-        fake.crc = Some(0x1234_5678);
-        fake
-    };
+    let status = |word| device(BOOTLOADER, |fake| fake.on_block = Box::new(move |_| Outcome::Status(word)));
     for (fake, number) in [
-        (wrong(), 0x6000_0001),
+        (device(BOOTLOADER, |fake| fake.crc = Some(0x1234_5678)), 0x6000_0001),
         (status(0x04), 0x6000_0002),
         (status(0x06), 0x6000_0003),
         (status(0x08), 0x6000_0004),
@@ -51,15 +32,14 @@ fn with_legacy_exit_codes_the_program_ends_with_the_manuals_numbers() {
         (status(0x0E), 0x6000_0007),
         (status(0x84), 0x6000_0008),
         (status(0x86), 0x6000_0012),
-        (absent(), 0x6000_0013),
-        (dead(), 0x6000_0014),
+        (device(BOOTLOADER, |fake| fake.running = None), 0x6000_0013),
+        (device(BOOTLOADER, |fake| fake.starts = Some(BOOTLOADER)), 0x6000_0014),
         (quick(BOOTLOADER), 0),
     ] {
-        let (bus, server) = serve(fake);
-        let times = "--boot-timeout 200 --sdo-timeout 100";
-        let done = typed(&format!("flash --legacy-exit-codes --bus {bus} -N 5 {file} {times}"));
+        let times = ["--boot-timeout", "200", "--sdo-timeout", "100"];
+        let (done, _) =
+            served(fake, &[&["flash", "--legacy-exit-codes", "-N", "5", &file][..], &times].concat());
         assert_eq!(done.exit, shown(number), "{number:08X}h: {}", done.err);
-        server.join().unwrap();
     }
 }
 
@@ -70,7 +50,7 @@ fn without_a_device_they_are_the_manuals_too() {
     drop(listener);
     let folder = folder("legacy-exit");
     let file = data("plain-400.blk");
-    let hex = std::fs::read_to_string(data("program.hex")).unwrap();
+    let hex = fs::read_to_string(data("program.hex")).unwrap();
     // A record with the checksum FDh in place of FEh, and one that is cut off.
     let damaged = folder.file("damaged.hex", b":0100000001FD\n:00000001FF\n");
     let cut = folder.file("cut.hex", hex.replacen(":08", ":09", 1).as_bytes());
@@ -92,19 +72,16 @@ fn without_a_device_they_are_the_manuals_too() {
         (&["--version"], 0),
     ] {
         for way in [true, false] {
-            let mut command = crate::tool::command();
+            let mut command = command();
             command.args(arguments);
-            let done = run(if way {
-                command.arg("--legacy-exit-codes")
-            } else {
-                command.env("COFLASH_LEGACY_EXIT_CODES", "1")
+            let done = run(match way {
+                true => command.arg("--legacy-exit-codes"),
+                false => command.env("COFLASH_LEGACY_EXIT_CODES", "1"),
             });
             assert_eq!(done.exit, shown(number), "{arguments:?}, {number:08X}h: {}", done.err);
         }
     }
-    let mut command = crate::tool::command();
-    let done = run(command.args(["flash", &file, "-N", "128"]).env("COFLASH_LEGACY_EXIT_CODES", "0"));
-    assert_eq!(done.exit, 2, "{}", done.err);
+    run(command().args(["flash", &file, "-N", "128"]).env("COFLASH_LEGACY_EXIT_CODES", "0")).fails(2, &[]);
 }
 
 /// Tables 12 and 13, printed with the options of chapter 5.3; no file and no bus is needed.
@@ -146,9 +123,16 @@ fn a_question_mark_lists_interfaces_and_bit_rates() {
 fn dot_net(file: &str, call: &str, bus: &str) -> Done {
     let folder = folder("dot-net");
     folder.file(file, &fs::read(data("plain-400.blk")).unwrap());
-    let mut command = crate::tool::command();
-    command.current_dir(&folder).args(["--bus", bus, "flash"]);
-    run(command.args(call.split_whitespace()))
+    let words = ["--bus", bus, "flash"];
+    run(command().current_dir(&folder).args(words).args(call.split_whitespace()))
+}
+
+/// Such a call on the bus of this device, which succeeds.
+fn dot_net_on(fake: Fake, file: &str, call: &str) -> (Done, Fake) {
+    let (bus, server) = serve(fake);
+    let done = dot_net(file, call, &bus);
+    assert_eq!(done.exit, 0, "{call}: {}", done.err);
+    (done, server.join().unwrap())
 }
 
 const NO_TRIAL: &str =
@@ -171,12 +155,9 @@ fn the_examples_of_dotnetflashtool_word_by_word() {
             2,
         ),
     ] {
-        let (bus, server) = serve(quick(BOOTLOADER).at(node, program));
-        let done = dot_net(file, call, &bus);
-        assert_eq!(done.exit, 0, "{call}: {}", done.err);
+        let (done, fake) = dot_net_on(quick(BOOTLOADER).at(node, program), file, call);
         assert_eq!(done.out.matches(NO_TRIAL).count(), 1, "{call}: {}", done.out);
         assert_eq!(done.err.matches("is ignored").count(), ignored, "{call}: {}", done.err);
-        let fake = server.join().unwrap();
         assert_eq!(fake.running, Some(APPLICATION), "{call}");
         let commands: Vec<&str> = fake.writes().into_iter().filter(|entry| entry.starts_with("c")).collect();
         assert_eq!(commands, ["command 03", "command 83", "command 01"], "{call}");
@@ -200,10 +181,7 @@ fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
         ("-F blcop_app.bin -N 5", 0),
         ("blcop_app.bin -N 5 --no-trial", 0),
     ] {
-        let (bus, server) = serve(quick(BOOTLOADER));
-        let done = dot_net("blcop_app.bin", call, &bus);
-        assert_eq!(done.exit, 0, "{call}: {}", done.err);
-        let fake = server.join().unwrap();
+        let (done, fake) = dot_net_on(quick(BOOTLOADER), "blcop_app.bin", call);
         assert!(fake.blocks.concat() == fs::read(data("plain-400.blk")).unwrap(), "{call}");
         assert_eq!(fake.count("command 80"), trials, "{call}");
         assert_eq!(fake.count("command 83"), 1, "{call}");
@@ -214,15 +192,13 @@ fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
     let folder = folder("dot-net-job");
     folder.file("blcop_app.bin", &fs::read(data("plain-400.blk")).unwrap());
     let job = folder.file("job.toml", b"[[program]]\nimage = 'blcop_app.bin'\nnodes = [5]\n");
-    let (bus, server) = serve(quick(BOOTLOADER));
-    let done = coflash(&["--bus", &bus, "flash", "--job", &job, "--prog_no", "1"]);
+    let (done, fake) = served(quick(BOOTLOADER), &["flash", "--job", &job, "--prog_no", "1"]);
     assert_eq!((done.exit, done.out.contains(NO_TRIAL)), (0, false), "{}", done.err);
-    assert_eq!(server.join().unwrap().count("command 80"), 1);
+    assert_eq!(fake.count("command 80"), 1);
     // A program that is not started is not released either.
-    let (bus, server) = serve(quick(BOOTLOADER));
-    let done = dot_net("blcop_app.bin", "-F blcop_app.bin --node_id 5 --no-start", &bus);
-    assert_eq!((done.exit, done.out.contains("no trial")), (0, false), "{}", done.err);
-    assert_eq!(server.join().unwrap().count("command 83"), 0);
+    let call = "-F blcop_app.bin --node_id 5 --no-start";
+    let (done, fake) = dot_net_on(quick(BOOTLOADER), "blcop_app.bin", call);
+    assert_eq!((done.out.contains("no trial"), fake.count("command 83")), (false, 0), "{}", done.out);
 }
 
 /// DotNetFlashtool knows no new bootloaders, and without its trial none is installed: here its words
@@ -231,7 +207,7 @@ fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
 fn its_words_leave_the_trial_of_a_bootloader_in() {
     let folder = folder("dot-net-bootloader");
     let file = folder.file("new.bin", &image(0x0000_0102));
-    let call = |words: &[&str]| coflash(&[&["--bus", "socketcand://127.0.0.1:1/x", "flash"], words].concat());
+    let call = |words: &[&str]| coflash(&[&["--bus", NOWHERE, "flash"], words].concat());
     let done = call(&["-F", &file, "--node_id", "5"]);
     assert_eq!(done.exit, 4, "{}", done.err);
     assert!(done.out.contains("bootloader") && !done.out.contains("no trial"), "{}", done.out);
@@ -251,8 +227,7 @@ fn words_that_contradict_each_other_are_refused() {
         (&[&file, "--gateway_id", "3"], "SDO gateway"),
         (&[&file, "-B", "9"], "0 (1 Mbit/s) to 8"),
     ] {
-        coflash(&[&["--bus", "socketcand://127.0.0.1:1/x", "flash"][..], words].concat())
-            .fails(2, &[expected]);
+        coflash(&[&["--bus", NOWHERE, "flash"], words].concat()).fails(2, &[expected]);
     }
 }
 
@@ -270,19 +245,16 @@ fn a_wrong_node_id_has_the_manuals_number() {
         (&["info", "-N", "128"], "node-IDs are 1 to 127"),
     ] {
         let done = coflash(&[&["--json"][..], words].concat());
-        let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+        let json = done.json();
         assert_eq!((done.exit, &json["error"]["number"]), (2, &"0x60000017".into()), "{words:?}: {json}");
         assert!(json["error"]["what"].as_str().unwrap().contains(expected), "{words:?}: {json}");
     }
     // Any other wrong command line has the number with which the manual's tools would end.
-    let json: serde_json::Value =
-        serde_json::from_str(&coflash(&["--json", "flash", "--no-such"]).out).unwrap();
-    assert_eq!(json["error"]["number"], "0x60000018");
+    assert_eq!(coflash(&["--json", "flash", "--no-such"]).json()["error"]["number"], "0x60000018");
     // This tool has no node-ID of its own.
-    let (bus, server) = serve(quick(BOOTLOADER).at(127, 1));
-    let done = dot_net("blcop_app.bin", "-F blcop_app.bin --node 127", &bus);
-    assert_eq!(done.exit, 0, "{}", done.err);
-    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+    let call = "-F blcop_app.bin --node 127";
+    let (_, fake) = dot_net_on(quick(BOOTLOADER).at(127, 1), "blcop_app.bin", call);
+    assert_eq!(fake.running, Some(APPLICATION));
 }
 
 /// Table 11: the default of --br_idx is 0, 1 Mbit/s (table 13), S8 of the CAN232 manual. An adapter
@@ -323,7 +295,7 @@ fn a_file_that_is_not_of_the_named_format_is_error_21h() {
     ] {
         for command in ["convert", "flash"] {
             let done = coflash(&["--json", command, file, "-I", format]);
-            let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+            let json = done.json();
             assert_eq!((done.exit, &json["error"]["number"]), (3, &number.into()), "{file}: {json}");
             assert!(json["error"]["what"].as_str().unwrap().contains(words), "{file}: {json}");
         }
@@ -337,14 +309,10 @@ fn a_file_that_is_not_of_the_named_format_is_error_21h() {
 fn a_serial_line_has_115200_bits_a_second() {
     let file = data("plain-400.blk");
     let line = ["--node_id", "0x05", "--vxd_type", "16", "--device_no", "7"];
-    let (bus, server) = serve(quick(BOOTLOADER));
-    coflash(&[&["--bus", &bus, "flash", "-F", &file, "--baudrate", "115200"][..], &line].concat())
-        .fails(0, &["--vxd_type is ignored"]);
-    server.join().unwrap();
+    let words = [&["flash", "-F", &file, "--baudrate", "115200"][..], &line].concat();
+    served(quick(BOOTLOADER), &words).0.fails(0, &["--vxd_type is ignored"]);
     // Without --bus, the number names the port.
-    let done = coflash(&[&["flash", "-F", &file, "--baudrate", "115200"][..], &line].concat());
-    let port = if cfg!(windows) { "COM7" } else { "/dev/ttyS6" };
-    done.fails(4, &[port]);
+    coflash(&words).fails(4, &[if cfg!(windows) { "COM7" } else { "/dev/ttyS6" }]);
     for (options, words) in [
         (&["--baudrate", "9600", "--vxd_type", "16"][..], "its bit rate is 115200"),
         (&["--baudrate", "115200"], "1 to 1000 kbit/s"),
@@ -361,16 +329,13 @@ fn the_can_ethernet_gateway_stops_and_names_what_to_use() {
     let example = "–F blcop_app.bin --node_id 20 --vxd_type 14 --ip_addr 192.168.1.10 --ip_port 1234";
     let (bus, server) = serve(quick(BOOTLOADER));
     let refused = |done: &Done| {
-        assert_eq!(done.exit, 2, "{}", done.err);
-        for words in ["--vxd_type 14", "--bus", "socketcand://", "slcan:tcp://", "cia309://"] {
-            assert!(done.err.contains(words), "{words}: {}", done.err);
-        }
+        done.fails(2, &["--vxd_type 14", "--bus", "socketcand://", "slcan:tcp://", "cia309://"]);
     };
     refused(&dot_net("blcop_app.bin", example, &bus));
     let file = data("plain-400.blk");
     let words = ["flash", "-F", &file, "--node_id", "20", "--vxd_type", "14"];
     refused(&coflash(&words));
-    refused(&run(crate::tool::command().args(words).env("COFLASH_BUS", &bus)));
+    refused(&run(command().args(words).env("COFLASH_BUS", &bus)));
     // The bus was never opened: the first connection is this one.
     coflash(&["--bus", &bus, "more", "release", "-N", "5"]).good();
     assert_eq!(server.join().unwrap().count("command 83"), 1);
@@ -380,12 +345,9 @@ fn the_can_ethernet_gateway_stops_and_names_what_to_use() {
 #[test]
 fn attempts_of_a_request_are_as_many_as_said() {
     for (options, times) in [(&[][..], 3), (&["--sdo-attempts", "1"], 1), (&["--sdo-attempts", "5"], 5)] {
-        let mut fake = quick(BOOTLOADER);
-        fake.on_command = Box::new(|_| Outcome::LoseRequest);
-        let (bus, server) = serve(fake);
-        let words = ["--bus", &bus, "more", "release", "-N", "5", "--sdo-timeout", "40"];
-        let done = coflash(&[&words[..], options].concat());
-        assert_eq!(done.exit, 5, "{}", done.err);
-        assert_eq!(server.join().unwrap().count("command 83"), times);
+        let fake = device(BOOTLOADER, |fake| fake.on_command = Box::new(|_| Outcome::LoseRequest));
+        let words = ["more", "release", "-N", "5", "--sdo-timeout", "40"];
+        let (done, fake) = served(fake, &[&words[..], options].concat());
+        assert_eq!((done.exit, fake.count("command 83")), (5, times), "{}", done.err);
     }
 }

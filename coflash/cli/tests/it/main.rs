@@ -24,7 +24,9 @@ use std::process::Command;
 
 use coflash_core::file::ihex;
 
-use crate::tool::{coflash, data, folder, quick, run, snapshot, typed};
+use serde_json::Value;
+
+use crate::tool::{coflash, command, data, device, folder, quick, run, served, snapshot, NOWHERE};
 use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 #[test]
@@ -64,9 +66,9 @@ fn a_build_script_for_the_manuals_converter_works() {
     let folder = folder("legacy");
     let input = folder.file("blcop_app.hex", &fs::read(data("program.hex")).unwrap());
     let call = |options: &[&str]| {
-        let mut command = crate::tool::command();
-        command.current_dir(&folder).arg("convert").args(options);
-        run(command.env("SOURCE_DATE_EPOCH", "1420070400"))
+        let mut convert = command();
+        convert.current_dir(&folder).arg("convert").args(options);
+        run(convert.env("SOURCE_DATE_EPOCH", "1420070400"))
     };
     let region = ["--start_address", "0x08010000", "--end_address", "0x080FFFFF"];
     let label = ["--vid", "0", "--pid", "1234", "--ver", "0x00640A01"];
@@ -77,9 +79,7 @@ fn a_build_script_for_the_manuals_converter_works() {
     assert!(fs::read(folder.path("blcop_app.tmp")).unwrap() == fs::read(data("program.bin")).unwrap());
     // Octal and suffixed numbers, the byte-wide fill of 2008, the CRC-16, and no name for the
     // output.
-    let done =
-        call(&["--block_size", "02000", "--gap_fill", "0xFFul", "--crc16", "--adjust_start", "0", &input]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+    call(&["--block_size", "02000", "--gap_fill", "0xFFul", "--crc16", "--adjust_start", "0", &input]).good();
     assert!(fs::read(folder.path("blcop_app.blk")).unwrap() == fs::read(data("crc16-400.blk")).unwrap());
     for format in ["S3", "S5", "S9", "srec"] {
         call(&["-I", format, &data("program.s3"), "s.blk", "--start_address", "0x08010000"]).good();
@@ -133,12 +133,7 @@ fn a_nameplate_goes_into_its_block() {
         }
         assert_eq!(image.byte_count(), 32 + u64::from(locks));
     }
-    let done = make(&["--json"]);
-    assert!(
-        done.out.contains(r#""serial_number":0"#) && done.out.contains(r#""locked":false"#),
-        "{}",
-        done.out
-    );
+    make(&["--json"]).says(&[r#""serial_number":0"#, r#""locked":false"#]);
     assert!(
         ihex::read(&fs::read(&out).unwrap()).unwrap().bytes(0x1FFF_781C) == Some([0xEC, 0x22, 0x54, 0x33])
     );
@@ -193,13 +188,11 @@ fn each_fault_of_a_file_says_what_to_do() {
         assert!(todo.contains(advice), "{what}: {}", done.err);
     }
     // Addresses of 24 bits do not reach the flash.
-    let done =
-        coflash(&["convert", &data("program.s2"), &folder.path("out.blk"), "--board", "nucleo-f446re"]);
-    assert_eq!(done.exit, 3, "{}", done.err);
-    assert!(done.err.contains("S3 records") && done.err.contains("--adjust-start"), "{}", done.err);
+    coflash(&["convert", &data("program.s2"), &folder.path("out.blk"), "--board", "nucleo-f446re"])
+        .fails(3, &["S3 records", "--adjust-start"]);
     let low = fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", "", 1);
-    let done = coflash(&["convert", &folder.file("low.hex", low.as_bytes()), &folder.path("out.blk")]).good();
-    assert!(done.err.contains("S3 records") && done.err.contains("warning"), "{}", done.err);
+    coflash(&["convert", &folder.file("low.hex", low.as_bytes()), &folder.path("out.blk")])
+        .fails(0, &["S3 records", "warning"]);
     // Addresses that a person has moved are as they were asked for, also in a block file.
     for (file, options) in [("program.hex", &["--adjust-start", "0xF8000000"][..]), ("adjusted-400.blk", &[])]
     {
@@ -212,14 +205,12 @@ fn each_fault_of_a_file_says_what_to_do() {
 #[test]
 fn inspect_tells_what_a_file_holds() {
     let shown = |file: &str, options: &[&str]| {
-        let done =
-            run(crate::tool::command().current_dir(data("")).args(["inspect", file]).args(options)).good();
-        done.out
+        run(command().current_dir(data("")).args(["inspect", file]).args(options)).good()
     };
-    snapshot("inspect-release", &shown("release-110.blk", &[]));
-    snapshot("inspect-crc16", &shown("crc16-400.blk", &["--board", "nucleo-f446re"]));
-    snapshot("inspect-hex", &shown("program.hex", &[]));
-    let json: serde_json::Value = serde_json::from_str(&shown("release-110.blk", &["--json"])).unwrap();
+    snapshot("inspect-release", &shown("release-110.blk", &[]).out);
+    snapshot("inspect-crc16", &shown("crc16-400.blk", &["--board", "nucleo-f446re"]).out);
+    snapshot("inspect-hex", &shown("program.hex", &[]).out);
+    let json = shown("release-110.blk", &["--json"]).json();
     assert_eq!(json["format"], "block file");
     assert_eq!(json["blocks"]["identity"]["product_code"], 1234);
     assert_eq!(json["blocks"]["release"]["version_text"], "V1.10r100");
@@ -232,7 +223,7 @@ fn inspect_tells_what_a_file_holds() {
     damaged[0x50] ^= 1;
     let done = coflash(&["inspect", "--json", &folder.file("damaged.blk", &damaged)]);
     assert_eq!((done.exit, done.err.as_str()), (3, ""));
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    let json = done.json();
     assert_eq!(json["error"]["number"], "0x60000020");
     assert!(json["error"]["what"].as_str().unwrap().contains("CRC of block 1"), "{}", done.out);
     let far =
@@ -254,13 +245,10 @@ fn inspect_tells_what_a_file_holds() {
     }
     // The manual's tool converts any data; without a board it is done with a warning.
     let signed = folder.file("signed.bin", &[&b"\x3D\xB8\xF3\x96"[..], &[0; 60]].concat());
-    let done = coflash(&["convert", &signed, &out, "--start-address", "0x08020000"]).good();
-    assert!(done.err.contains("warning") && done.err.contains("an image for MCUboot"), "{}", done.err);
+    coflash(&["convert", &signed, &out, "--start-address", "0x08020000"])
+        .fails(0, &["warning", "an image for MCUboot"]);
     coflash(&["convert", &signed, &out]).fails(3, &["but an image for MCUboot", "zephyr.elf"]);
 }
-
-/// A bus with a valid URL that does not exist.
-const NOWHERE: &str = "socketcand://127.0.0.1:1/x";
 
 /// A file without an end, or larger than any firmware, is reported and not read.
 #[test]
@@ -283,11 +271,13 @@ fn what_is_no_file_or_too_large_is_not_read() {
             coflash(&[command, &[file]].concat()).fails(3, &[words]);
         }
     }
-    for (option, file) in [("--job", "/dev/zero"), ("--job", settings.as_str())] {
-        coflash(&["--bus", NOWHERE, "flash", option, file]).fails(3, &["has more than 1048576 bytes"]);
+    for words in [
+        &["--bus", NOWHERE, "flash", "--job", "/dev/zero"][..],
+        &["--bus", NOWHERE, "flash", "--job", &settings],
+        &["--config", "/dev/zero", "inspect", &data("program.hex")],
+    ] {
+        coflash(words).fails(3, &["has more than 1048576 bytes"]);
     }
-    coflash(&["--config", "/dev/zero", "inspect", &data("program.hex")])
-        .fails(3, &["has more than 1048576 bytes"]);
 }
 
 /// The image of a bootloader is refused before the bus is opened, and so is an image that is not a
@@ -301,13 +291,10 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
     let flash = |file: &str, options: &[&str]| {
         coflash(&[&["--bus", NOWHERE, "flash", file, "-I", "binary"], options].concat())
     };
+    let at_the_start = "bootloader.bin: begins at the start of the flash";
     for (file, options, words) in [
-        (
-            &bootloader,
-            &["--start-address", "0x08000000"][..],
-            "bootloader.bin: begins at the start of the flash",
-        ),
-        (&bootloader, &["--dialect", "raw"], "bootloader.bin: begins at the start of the flash"),
+        (&bootloader, &["--start-address", "0x08000000"][..], at_the_start),
+        (&bootloader, &["--dialect", "raw"], at_the_start),
         (&bootloader, &["--board", "nucleo-f446re"], "its reset vector is 08000189h, outside 0x08010000"),
         (&zeros, &["--board", "nucleo-f446re"], "zeros.bin: is not a program: all its bytes are 00h"),
         (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is not a program"),
@@ -335,17 +322,12 @@ fn the_label_is_shown_and_goes_into_block_0() {
     let file = folder.file("app.bin", &image);
     let raw = ["-I", "binary", "--board", "nucleo-f446re"];
 
-    let done = coflash(&[&["inspect", &file][..], &raw].concat());
-    assert!(
-        done.out.contains("  label        vendor-ID 00000319h, product code 4007D151h, version V3.2r1\n")
-            && done.out.contains("  judged       can be a program"),
-        "{}",
-        done.out
-    );
-    let done = coflash(&[&["--json", "inspect", &file][..], &raw].concat());
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
-    assert_eq!(json["label"]["product_code"], 0x4007_D151);
-    assert_eq!(json["fault"], serde_json::Value::Null);
+    coflash(&[&["inspect", &file][..], &raw].concat()).says(&[
+        "  label        vendor-ID 00000319h, product code 4007D151h, version V3.2r1\n",
+        "  judged       can be a program",
+    ]);
+    let json = coflash(&[&["--json", "inspect", &file][..], &raw].concat()).json();
+    assert_eq!((&json["label"]["product_code"], &json["fault"]), (&0x4007_D151.into(), &Value::Null));
 
     let out = folder.path("app.blk");
     for (options, data) in [
@@ -355,12 +337,9 @@ fn the_label_is_shown_and_goes_into_block_0() {
         (&["--vid", "1", "--pid", "2"], vec![1024, 1, 2]),
         (&["--no-label"], vec![0, 0]),
     ] {
-        let done = run(crate::tool::command()
-            .args(["convert", &file, &out])
-            .args(raw)
-            .args(options)
-            .env_remove("SOURCE_DATE_EPOCH"))
-        .good();
+        let mut convert = command();
+        convert.args(["convert", &file, &out]).args(raw).args(options);
+        let done = run(convert.env_remove("SOURCE_DATE_EPOCH")).good();
         let block: Vec<u8> = data.iter().flat_map(|word: &u32| word.to_le_bytes()).collect();
         let bytes = fs::read(&out).unwrap();
         assert_eq!(bytes[8..12], (block.len() as u32).to_le_bytes(), "{options:?}");
@@ -370,12 +349,10 @@ fn the_label_is_shown_and_goes_into_block_0() {
     // A date that would be lost is refused.
     for options in [&["--vid", "1", "--pid", "2"][..], &["--no-label"]] {
         let date = ["--date", "1420070400"];
-        let done = coflash(&[&["convert", &file, &out][..], &raw, options, &date].concat());
-        assert!(done.exit == 2 && done.err.contains("without --ver"), "{options:?}: {}", done.err);
+        coflash(&[&["convert", &file, &out][..], &raw, options, &date].concat()).fails(2, &["without --ver"]);
     }
     // The block file has the label, too, and `inspect` shows it.
-    let done = coflash(&["inspect", &out]);
-    assert!(done.out.contains("  label        vendor-ID 00000319h"), "{}", done.out);
+    coflash(&["inspect", &out]).says(&["  label        vendor-ID 00000319h"]);
 }
 
 #[test]
@@ -384,18 +361,14 @@ fn quiet_says_nothing_and_json_says_one_document() {
     let out = folder.path("out.blk");
     let done = coflash(&["convert", "-q", &data("program.elf"), &out]);
     assert_eq!((done.exit, done.out.as_str(), done.err.as_str()), (0, "", ""));
-    let done = coflash(&["--json", "convert", &data("program.elf"), &out]);
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    let json = coflash(&["--json", "convert", &data("program.elf"), &out]).json();
     let crc = u32::from_le_bytes(fs::read(data("plain-400.blk")).unwrap()[0x36B..0x36F].try_into().unwrap());
     assert_eq!((&json["program"]["size"], &json["program"]["crc"]), (&4001.into(), &crc.into()));
     assert_eq!((&json["blocks"], &json["left_out"]), (&4.into(), &0.into()));
     // A warning about data that are left out appears beside the document.
     let done = coflash(&["--json", "convert", &data("program.elf"), &out, "--end-address", "0x080102C5"]);
-    assert!(
-        done.exit == 0 && done.err.contains("25 bytes outside the address range were left out [0x60002001]")
-    );
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
-    assert_eq!(json["left_out"], 25);
+    done.fails(0, &["25 bytes outside the address range were left out [0x60002001]"]);
+    assert_eq!(done.json()["left_out"], 25);
 }
 
 #[test]
@@ -449,13 +422,8 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
         let board = ["--board", "nucleo-f446re"];
         for command in [&["convert", &file, &out][..], &["--bus", &bus, "flash", &file]] {
             let done = coflash(&[command, &board].concat());
-            assert_eq!(done.exit, 3, "{name}: {}", done.err);
-            assert!(
-                done.err.starts_with("error: ") && done.err.contains(&words),
-                "{}\n not {words}",
-                done.err
-            );
-            assert!(done.err.contains("[0x600000"), "{}", done.err);
+            assert!(done.err.starts_with("error: "), "{}", done.err);
+            done.fails(3, &[&words, "[0x600000"]);
         }
         assert!(!Path::new(&out).exists());
     }
@@ -490,15 +458,11 @@ fn wrong_usage_is_explained() {
 
 #[test]
 fn flash_and_info_over_a_socket() {
-    let fake = quick(APPLICATION);
-    let (bus, server) = serve(fake);
-    let done =
-        coflash(&["--bus", &bus, "flash", "--node", "5", "--board", "nucleo-f446re", &data("program.elf")]);
-    assert_eq!(done.exit, 0, "{}", done.err);
-    let fake = server.join().unwrap();
+    let words = ["flash", "--node", "5", "--board", "nucleo-f446re", &data("program.elf")];
+    let (done, fake) = served(quick(APPLICATION), &words);
     assert_eq!(fake.blocks.concat(), fs::read(data("plain-400.blk")).unwrap());
     assert_eq!(fake.running, Some(APPLICATION));
-    for words in [
+    done.says(&[
         "calling the application back",
         "the bootloader is running",
         "100 %  883 of 883 bytes",
@@ -506,12 +470,10 @@ fn flash_and_info_over_a_socket() {
         "released for autostart",
         "running: an application",
         "done in ",
-    ] {
-        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
-    }
+    ]);
 
     let (bus, _server) = serve(fake);
-    let done = run(crate::tool::command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus)).good();
+    let done = run(command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus)).good();
     assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
 }
 
@@ -521,8 +483,8 @@ fn the_target_is_checked_before_anything_is_erased() {
     // --force leaves the device to judge, but not what the user asks to be checked.
     let other = ["--force", "--vid", "0x40", "--pid", "1234"];
     for option in [&["--check-target"][..], &["--chk_tgt", "1"]] {
-        let (bus, server) = serve(Fake::new(APPLICATION));
-        let done = coflash(&[&["--bus", &bus, "flash", "--node", "5", &file][..], &other, option].concat());
+        let words = [&["flash", "--node", "5", &file][..], &other, option].concat();
+        let (done, fake) = served(Fake::new(APPLICATION), &words);
         assert_eq!(done.exit, 6, "{}", done.err);
         assert_eq!(
             done.err,
@@ -530,21 +492,18 @@ fn the_target_is_checked_before_anything_is_erased() {
              the device: it was not changed\n  what to do: check that file and device belong together \
              (coflash info shows the device's identity)\n"
         );
-        assert_eq!(server.join().unwrap().writes().len(), 0);
+        assert_eq!(fake.writes().len(), 0);
     }
     // A file that names no device cannot be checked, unless the command line names one.
     let plain = data("program.elf");
-    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--check-target", &plain])
-        .fails(2, &["--vid and --pid"]);
-    let fake = quick(BOOTLOADER);
-    let (bus, server) = serve(fake);
-    let target = "--check-target --vid 0x3F --pid 1234";
-    let done = typed(&format!("--json --bus {bus} flash -N 5 {target} --no-start {plain}")).good();
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    coflash(&["--bus", NOWHERE, "flash", "--check-target", &plain]).fails(2, &["--vid and --pid"]);
+    let target = ["--check-target", "--vid", "0x3F", "--pid", "1234"];
+    let words = [&["--json", "flash", "-N", "5", "--no-start", &plain][..], &target].concat();
+    let (done, fake) = served(quick(BOOTLOADER), &words);
+    let json = done.good().json();
     assert_eq!((&json["command"], &json["node"], &json["program"]), (&"flash".into(), &5.into(), &1.into()));
-    assert_eq!((&json["size"], &json["running"]), (&4001.into(), &serde_json::Value::Null));
+    assert_eq!((&json["size"], &json["running"]), (&4001.into(), &Value::Null));
     assert_eq!((&json["transfer"], &json["blocks_repeated"]), (&"segments".into(), &0.into()));
-    let fake = server.join().unwrap();
     // Block 0: vendor-ID and product code after the size.
     assert_eq!(fake.blocks[0][16..24], [0x3F, 0, 0, 0, 0xD2, 4, 0, 0]);
     assert_eq!(fake.count("command 01"), 0);
@@ -552,14 +511,11 @@ fn the_target_is_checked_before_anything_is_erased() {
 
 #[test]
 fn a_failure_in_json_has_the_manuals_number_and_the_devices_state() {
-    let mut fake = quick(BOOTLOADER);
-    fake.on_block = Box::new(|_| Outcome::Status(0x0E));
-    let (bus, server) = serve(fake);
-    let done = coflash(&["flash", "--json", "--bus", &bus, "-N", "5", &data("plain-400.blk")]);
+    let fake = device(BOOTLOADER, |fake| fake.on_block = Box::new(|_| Outcome::Status(0x0E)));
+    let (done, _) = served(fake, &["flash", "--json", "-N", "5", &data("plain-400.blk")]);
     assert_eq!((done.exit, done.err.as_str()), (6, ""));
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    let json = done.json();
     assert_eq!(json["error"]["number"], "0x60000007");
     assert_eq!((&json["error"]["exit"], &json["error"]["device"]), (&6.into(), &"erased".into()));
     assert_eq!(json["error"]["seen"]["bootloader"], true);
-    server.join().unwrap();
 }

@@ -9,6 +9,7 @@ use coflash_core::device::lss::LssAddress;
 use coflash_core::file::sealed::{Sealer, SigningKey};
 use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
+use crate::sealing::Room;
 use crate::tool::{coflash, command, data, folder, run, Done};
 use kit::fake::{serve, Fake, APPLICATION};
 use kit::folder::Folder;
@@ -66,15 +67,10 @@ fn the_pages_example_is_a_job() {
     let devices = recipe.devices().unwrap();
     let nodes: Vec<_> = devices.iter().filter_map(|device| device.node).map(NodeId::get).collect();
     assert_eq!(nodes, [5, 7, 6, 9]);
-    let rows: Vec<_> = devices.iter().map(|device| device.row).collect();
-    assert_eq!(
-        (rows[0].trial_run, rows[2].start, rows[0].board.as_deref()),
-        (Some(true), Some(false), Some("stm32f407g-disc1"))
-    );
-    assert_eq!(
-        (&*rows[0].image, &*rows[2].image),
-        (Path::new("folder/app.elf"), Path::new("folder/other.blk"))
-    );
+    let (first, third) = (devices[0].row, devices[2].row);
+    assert_eq!((first.trial_run, third.start), (Some(true), Some(false)));
+    assert_eq!((&*first.image, &*third.image), ("folder/app.elf".as_ref(), "folder/other.blk".as_ref()));
+    assert_eq!(first.board.as_deref(), Some("stm32f407g-disc1"));
     let address = LssAddress { vendor_id: 0x3F, product_code: 1, revision: 2, serial_number: 3 };
     assert_eq!((devices[0].address, devices[3].address), (None, Some(address)));
 }
@@ -87,6 +83,8 @@ fn a_fault_of_a_job_is_named_with_its_place() {
         parsed.and_then(|recipe| recipe.devices().map(drop)).unwrap_err().to_string()
     };
     let one = "[[program]]\nimage = 'a'\n";
+    let lss = "lss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n";
+    let other = "[[program]]\nimage = 'b'\n";
     for (more, words) in [
         ("", "program 1: it has neither nodes nor lss"),
         ("nodes = [128]\n", "program 1: node-IDs are 1 to 127"),
@@ -94,15 +92,9 @@ fn a_fault_of_a_job_is_named_with_its_place() {
         ("node = 5\n", "line 3: unknown field `node`"),
         ("nodes = [1]\nprogram = 255\n", "program 1: programs are 1 to 254"),
         ("nodes = [1, 2, 1]\n", "program 1: the recipe has one of its devices twice"),
-        (
-            "nodes = [1]\n[[program]]\nimage = 'b'\nnodes = [1]\n",
-            "program 2: the recipe has one of its devices twice",
-        ),
+        (&format!("nodes = [1]\n{other}nodes = [1]\n"), "program 2: the recipe has one of its devices twice"),
         ("lss = { vendor = 1 }\n", "product"),
-        (
-            "nodes = [1, 2]\nlss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n",
-            "program 1: one LSS address",
-        ),
+        (&format!("nodes = [1, 2]\n{lss}"), "program 1: one LSS address"),
         ("nodes = [1]\ncount = 3\n", "program 1: only a package has revision and count"),
         ("nodes = [1]\nvendor = 3\n", "program 1: vendor and product belong together"),
         ("nodes = [1]\ndialect = 'x'\n", "program 1: there is no dialect \"x\""),
@@ -173,17 +165,10 @@ struct Line(Folder);
 
 impl Line {
     fn new(test: &str) -> Self {
-        let line = Self(folder(test));
+        let line = Self(Room::new(test).0);
         fs::copy(data("plain-400.blk"), line.0.join("b.blk")).unwrap();
-        line.0.file("line.toml", b"[[program]]\nimage = 'b.blk'\nvendor = 1\nproduct = 2\n");
-        for name in ["root", "release", "other"] {
-            let role = if name == "other" { "root" } else { name };
-            coflash(&["seal", "keys", "new", "--role", role, "-o", &line.at(&format!("{name}.pem"))]).good();
-        }
-        let (root, key) = (line.at("root.pem"), line.at("release.pub"));
-        let certify =
-            ["seal", "keys", "certify", "--root", &root, "--key", &key, "--epoch", "1", "--vendor", "1"];
-        coflash(&certify).good();
+        line.0.file("line.toml", b"[[program]]\nimage = 'b.blk'\nvendor = 63\nproduct = 2\n");
+        coflash(&["seal", "keys", "new", "--role", "root", "-o", &line.at("other.pem")]).good();
         line.package(&["--key", &line.at("release.pem"), "--cert", &line.at("release.cert")]).good();
         line
     }
@@ -202,13 +187,9 @@ impl Line {
 fn the_command_makes_and_shows_a_package() {
     let line = Line::new("recipe-command");
     let (package, root) = (line.at("line.cpk"), line.at("root.pub"));
-    let shown = coflash(&["inspect", &package, "--trust", &root]).good();
-    assert!(
-        shown.out.contains("b: program 1 of 4001 bytes, for vendor 00000001h, product 00000002h"),
-        "{}",
-        shown.out
-    );
-    assert!(shown.out.contains("signed by key ") && !shown.out.contains("not checked"), "{}", shown.out);
+    let words = ["b: program 1 of 4001 bytes, for vendor 0000003Fh, product 00000002h", "signed by key "];
+    let shown = coflash(&["inspect", &package, "--trust", &root]).says(&words);
+    assert!(!shown.out.contains("not checked"), "{}", shown.out);
     // With a second signer, whose root is not named.
     let both = line.at("both.cpk");
     let (release, cert, other) = (line.at("release.pem"), line.at("release.cert"), line.at("other.pem"));
@@ -248,6 +229,7 @@ fn what_contradicts_a_package_is_refused() {
     let named = &*line.0.file("x.CPK", &fs::read(data("plain-400.blk")).unwrap());
     let job = &*line.0.file("job.toml", b"[[program]]\nimage = 'a.blk'\nnodes = [5]\nstart = false\n");
     let before = &*line.0.file("before.toml", b"image = 'a.blk'\n[[device]]\nnode = 5\n");
+    let lost = "is a key, which would be lost";
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
@@ -255,15 +237,11 @@ fn what_contradicts_a_package_is_refused() {
         (&["package", recipe, "-o", recipe], 2, "replace its recipe"),
         (&["package", recipe, "-o", &aside], 2, "replace its recipe"),
         (&["package", recipe, "-o", &image], 2, "replace an image of its recipe"),
-        (
-            &["package", recipe, "--key", &release, "--cert", &cert, "-o", &release],
-            2,
-            "is a key, which would be lost",
-        ),
-        (&["package", recipe, "-o", &root], 2, "is a key, which would be lost"),
-        (&["convert", &data("plain-400.blk"), &root], 2, "is a key, which would be lost"),
-        (&["inspect", package, "--log-file", &root], 2, "is a key, which would be lost"),
-        (&["scan", "--bus", "slcan:no-such-port", "--trace", &root], 2, "is a key, which would be lost"),
+        (&["package", recipe, "--key", &release, "--cert", &cert, "-o", &release], 2, lost),
+        (&["package", recipe, "-o", &root], 2, lost),
+        (&["convert", &data("plain-400.blk"), &root], 2, lost),
+        (&["inspect", package, "--log-file", &root], 2, lost),
+        (&["scan", "--bus", "slcan:no-such-port", "--trace", &root], 2, lost),
         (&["package", recipe, "--key", &release, "--cert", &cert, "--cert", &cert], 2, "belong to one key"),
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),
@@ -320,8 +298,7 @@ fn a_device_that_an_interrupted_run_has_written_did_not_have_its_program() {
         fake.crc_of_application = Some(crc);
         let (url, _device) = serve(fake);
         let words = ["--bus", &url, "flash", &folder.path("line.cpk"), "--yes", "--json"];
-        let done = coflash(&[&words[..], &more].concat()).good();
-        serde_json::from_str::<Value>(&done.out).unwrap()["devices"][0].clone()
+        coflash(&[&words[..], &more].concat()).good().json()["devices"][0].clone()
     };
     let had = flash(["--report", &report]);
     assert_eq!(had["state"], "had", "{had:#}");

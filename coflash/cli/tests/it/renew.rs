@@ -3,48 +3,40 @@
 use std::fs;
 
 use kit::fake::renewal::{device, image, word_of, NEW, OLD};
-use kit::fake::{serve, APPLICATION, BOOTLOADER};
+use kit::fake::{APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
-use crate::tool::{coflash, folder};
+use crate::tool::{coflash, folder, served};
 
 #[test]
 fn flash_knows_a_bootloader_by_its_header() {
     let folder = folder("renew");
     let file = folder.file("new.bin", &image(NEW));
     let report = folder.path("report.json");
-    let (url, server) = serve(device(APPLICATION, |_| {}).0);
-    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5", "--report", &report]).good();
+    let words = ["flash", &file, "--node", "5", "--report", &report];
+    let (done, fake) = served(device(APPLICATION, |_| {}).0, &words);
     let crc = word_of(&image(NEW), 4);
-    for words in [
+    done.says(&[
         &format!("{file}: bootloader 1.3 of 320 bytes, CRC {crc:08X}h\n")[..],
         "  renewing the bootloader (program 2): version 1.2 -> 1.3; the program stays\n",
         "  installed: bootloader 1.3\n",
         "  running: an application",
         "s: bootloader 1.2 -> 1.3, installed\n",
-    ] {
-        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
-    }
-    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+    ]);
+    assert_eq!(fake.running, Some(APPLICATION));
     let written: Value = serde_json::from_str(&fs::read_to_string(&report).unwrap()).unwrap();
     let renewal = &written["devices"][0]["report"]["renewal"];
     assert_eq!((&renewal["number"], &renewal["from"], &renewal["to"]), (&2.into(), &OLD.into(), &NEW.into()));
 
-    let done = coflash(&["inspect", &file, "--start-address", "0x08010000"]);
-    for words in ["  bootloader   version 1.3, 320 bytes, CRC ", "a bootloader: coflash flash renews that of"]
-    {
-        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
-    }
-    let done = coflash(&["inspect", &file, "--start-address", "0x08010000", "--json"]);
-    let json: Value = serde_json::from_str(&done.out).unwrap();
+    let words = ["  bootloader   version 1.3, 320 bytes, CRC ", "a bootloader: coflash flash renews that of"];
+    coflash(&["inspect", &file, "--start-address", "0x08010000"]).says(&words);
+    let json = coflash(&["inspect", &file, "--start-address", "0x08010000", "--json"]).json();
     assert_eq!((&json["bootloader"]["version"], &json["fault"]), (&NEW.into(), &Value::Null));
 
     // By a job file, too.
     let job = folder.file("job.toml", b"[[program]]\nimage = 'new.bin'\nnodes = [5]\n");
-    let (url, server) = serve(device(BOOTLOADER, |_| {}).0);
-    let done = coflash(&["--bus", &url, "flash", "--job", &job]).good();
-    assert!(done.out.ends_with("1 of 1 devices are done\n"), "{}", done.out);
-    drop(server.join());
+    let (done, _) = served(device(BOOTLOADER, |_| {}).0, &["flash", "--job", &job]);
+    assert!(done.good().out.ends_with("1 of 1 devices are done\n"));
 }
 
 /// What is refused before a device is asked.

@@ -8,10 +8,10 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
-use crate::tool::{bootloader, command, data, folder, run, Done};
+use crate::tool::{bootloader, command, data, folder, run, within, Done};
 use canopen::{CobId, Frame};
 use coflash_core::machine::zip;
-use kit::fake::{serve, Outcome, BOOTLOADER};
+use kit::fake::{serve, Fake, Outcome, BOOTLOADER};
 use kit::folder::Folder;
 use kit::hawkbit::{Action, File, Server};
 use kit::http::Page;
@@ -78,14 +78,12 @@ fn a_bundle_has_no_secret_and_no_firmware() {
     let image = data("plain-400.blk");
     let flash = ["flash", &image, "-N", "5", "--dialect", "block"];
     let (url, _device) = serve(bootloader());
-    let line = recorded(&folder, &[&flash[..], &["--bus", &url, "--unlock", "PLANTED-line"]].concat(), &[]);
-    assert_eq!(line.exit, 0, "{}", line.err);
+    recorded(&folder, &[&flash[..], &["--bus", &url, "--unlock", "PLANTED-line"]].concat(), &[]).good();
     let (url, _device) = serve(bootloader());
-    let environment = [("COFLASH_UNLOCK", "PLANTED-env"), ("COFLASH_BUS", url.as_str())];
-    assert_eq!(recorded(&folder, &flash, &environment).exit, 0);
+    recorded(&folder, &flash, &[("COFLASH_UNLOCK", "PLANTED-env"), ("COFLASH_BUS", &url)]).good();
     folder.write("coflash.toml", b"unlock = \"PLANTED-config\"\n");
     let (url, _device) = serve(bootloader());
-    assert_eq!(recorded(&folder, &[&flash[..], &["--bus", &url, "--segmented"]].concat(), &[]).exit, 0);
+    recorded(&folder, &[&flash[..], &["--bus", &url, "--segmented"]].concat(), &[]).good();
     // Its frames: a password in segments.
     let (url, _device) = serve(bootloader());
     let write = ["write", "6005/1", "PLANTED-frame", "--type", "string", "-N", "5", "--bus", &url];
@@ -112,9 +110,7 @@ fn a_bundle_has_no_secret_and_no_firmware() {
     let (url, _device) = serve(bootloader());
     let query = format!("{url}?PLANTED-now");
     for bus in [&query, &url] {
-        let variables = [("COFLASH_BUS", bus.as_str()), ("COFLASH_UNLOCK", "PLANTED-env")];
-        let done = recorded(&folder, &words, &variables);
-        assert_eq!(done.exit, 0, "{}", done.err);
+        recorded(&folder, &words, &[("COFLASH_BUS", bus), ("COFLASH_UNLOCK", "PLANTED-env")]).good();
         let members = members(&folder.path("fault.zip"));
         for (name, bytes) in &members {
             let text = String::from_utf8(bytes.clone()).unwrap();
@@ -262,12 +258,9 @@ fn a_record_that_begins_within_a_password_does_not_have_it() {
     }
     let (url, _device) = serve(fake);
     let words = ["monitor", "--bus", &url, "--count", "5", "--for", "20000", "--log-file", "all.log"];
-    let done = recorded(&folder, &words, &[]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    recorded(&folder, &words, &[]).good();
     let run = runs(&folder).pop().unwrap();
-    let bundle = ["more", "report", "bundle", "reports", "-o", "fault.zip"];
-    let done = run_in(&folder, &bundle);
-    assert_eq!(done.exit, 0, "{}", done.err);
+    run_in(&folder, &["more", "report", "bundle", "reports", "-o", "fault.zip"]).good();
     let members = members(&folder.path("fault.zip"));
     let read = |path: PathBuf| fs::read_to_string(path).unwrap();
     let trace = read(run.join("trace.log"));
@@ -289,13 +282,11 @@ fn a_bundle_has_what_the_device_says_and_no_values_of_read() {
     let mut device = bootloader();
     device.readable = Some(b"FIRMWARE of the device".to_vec());
     let (url, _device) = serve(device);
-    let read = recorded(&folder, &["read", "1F50/1", "-N", "5", "--bus", &url], &[]);
-    assert!(read.exit == 0 && read.out.contains("FIRMWARE"), "{}{}", read.out, read.err);
+    recorded(&folder, &["read", "1F50/1", "-N", "5", "--bus", &url], &[]).says(&["FIRMWARE"]);
     let of_run = runs(&folder).pop().unwrap().display().to_string();
     let (url, _device) = serve(bootloader());
     let words = ["more", "report", "bundle", &of_run, "-N", "5", "--bus", &url, "--json"];
-    let done = run(command().current_dir(folder.path("")).args(words));
-    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let said = run_in(&folder, &words).json();
     assert_eq!((&said["runs"], &said["answer"]), (&1.into(), &"the device has answered".into()));
     let members = members(&folder.path("coflash-report.zip"));
     assert_eq!(json(&members, "device.json")["device_type"], BOOTLOADER);
@@ -338,17 +329,21 @@ fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
         (vec!["more", "report", "bundle"], "no CAN bus is given"),
         (vec!["more", "report", "bundle", "--bus", "nonsense:1"], "nonsense"),
     ] {
-        let done = run(command().current_dir(folder.path("")).args(&words));
-        assert!(done.exit == 0 && done.out.contains(why), "{words:?}: {}{}", done.out, done.err);
+        run_in(&folder, &words).says(&[why]);
         let members = members(&folder.path("coflash-report.zip"));
         assert!(json(&members, "device.json")["error"]["what"].as_str().unwrap().contains(why));
         assert!(text(&members, "README.txt").contains(why));
     }
-    run(command().current_dir(folder.path("")).args(["more", "report", "bundle", "none"]))
-        .fails(3, &["none: cannot be read"]);
+    run_in(&folder, &["more", "report", "bundle", "none"]).fails(3, &["none: cannot be read"]);
     fs::create_dir(folder.path("empty")).unwrap();
-    run(command().current_dir(folder.path("")).args(["more", "report", "bundle", "empty"]))
-        .fails(2, &["has no recorded run"]);
+    run_in(&folder, &["more", "report", "bundle", "empty"]).fails(2, &["has no recorded run"]);
+}
+
+/// A device to which block 1 never comes whole.
+fn refuses_block_1() -> Fake {
+    let mut device = bootloader();
+    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
+    device
 }
 
 /// A block with a wrong CRC is sent again, and again: the report has each attempt, what the device
@@ -356,9 +351,7 @@ fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
 #[test]
 fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let folder = folder("failed-update");
-    let mut device = bootloader();
-    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
-    let (url, _device) = serve(device);
+    let (url, _device) = serve(refuses_block_1());
     let image = data("plain-400.blk");
     let done = recorded(&folder, &["flash", &image, "-N", "5", "--bus", &url, "--block-repeats", "2"], &[]);
     assert_eq!(done.exit, 6, "{}", done.err);
@@ -383,8 +376,7 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let mut device = bootloader();
     device.on_command = Box::new(|_| Outcome::Abort(0x0800_0022));
     let (url, _device) = serve(device);
-    let done = recorded(&folder, &["erase", "-N", "5", "--bus", &url, "--json"], &[]);
-    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let said = recorded(&folder, &["erase", "-N", "5", "--bus", &url, "--json"], &[]).json();
     let answer = said["error"]["answers"][0].as_str().unwrap();
     assert!(answer.starts_with("SDO abort ") && answer.contains("08000022h"), "{said}");
     // A program that does not start: 2007h/2 says that the program is not released (docs/protocol.md).
@@ -392,14 +384,11 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     device.starts = Some(BOOTLOADER);
     device.state = Some([5, 0, 0]);
     let (url, _device) = serve(device);
-    let done = recorded(&folder, &["start", "-N", "5", "--bus", &url, "--json"], &[]);
-    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let said = recorded(&folder, &["start", "-N", "5", "--bus", &url, "--json"], &[]).json();
     let answers = said["error"]["answers"].to_string();
-    assert!(
-        answers.contains("1F57h reads ")
-            && answers.contains("2007h: it stays in the bootloader: its program is not released"),
-        "{said}"
-    );
+    for words in ["1F57h reads ", "2007h: it stays in the bootloader: its program is not released"] {
+        assert!(answers.contains(words), "{said}");
+    }
 }
 
 /// The report of the beginning stays when there is no room for that of the end.
@@ -407,14 +396,9 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
 #[test]
 fn a_folder_that_fills_up_keeps_the_report_that_it_has() {
     let folder = folder("full");
-    let mut device = bootloader();
-    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
-    let (url, _device) = serve(device);
-    let tool = command();
+    let (url, _device) = serve(refuses_block_1());
     // POSIX: the limit of a file's size, in units of 512 bytes.
-    let mut limited = Command::new("sh");
-    limited.args(["-c", r#"trap '' XFSZ; ulimit -f 2; exec "$@""#, "sh"]).arg(tool.get_program());
-    limited.envs(tool.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    let mut limited = within("sh", &["-c", r#"trap '' XFSZ; ulimit -f 2; exec "$@""#, "sh"]);
     let image = data("plain-400.blk");
     let words = ["flash", &image, "-N", "5", "--bus", &url, "--report-dir", "reports"];
     let done = run(limited.current_dir(folder.path("")).args(words));
@@ -428,9 +412,7 @@ fn a_folder_that_fills_up_keeps_the_report_that_it_has() {
 #[test]
 fn a_failed_update_of_the_agent_is_in_its_report_too() {
     let folder = folder("failed-agent");
-    let mut device = bootloader();
-    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
-    let (url, _device) = serve(device);
+    let (url, _device) = serve(refuses_block_1());
     let server = Server::start(&["door"]);
     let image = fs::read(data("plain-400.blk")).unwrap();
     server.assign("door", Action::new(1, &File::new("app.blk", &image)));

@@ -3,19 +3,17 @@
 use std::sync::{Arc, Mutex};
 
 use crate::sealing::{crc32, program, unwrapped, word, Room, START, VENDOR};
-use crate::tool::{coflash, quick, Done};
+use crate::tool::{coflash, device, quick, served, Done};
 use kit::fake::vault::Vault;
-use kit::fake::{serve, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
+use kit::fake::{Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 /// Flashes this file; returns the output, the data for the device, and the other writes.
 fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>, Vec<String>) {
     let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
-    let mut fake = quick(APPLICATION);
-    fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room, status }));
-    let (bus, server) = serve(fake);
-    let done = coflash(&[&["flash", file, "--bus", &bus, "-N", "5"], more].concat());
-    let fake = server.join().unwrap();
+    let vault = Vault { kept: kept.clone(), start: START, room, status };
+    let fake = device(APPLICATION, |fake| fake.maker = Some(Box::new(vault)));
+    let (done, fake) = served(fake, &[&["flash", file, "-N", "5"], more].concat());
     let kept = kept.lock().unwrap().clone();
     (done, kept, fake.writes().iter().map(ToString::to_string).collect())
 }
@@ -23,18 +21,18 @@ fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>,
 #[test]
 fn a_sealed_image_goes_into_a_device_as_it_is() {
     let room = Room::small("flash");
-    assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
+    room.seal("app.cbs", &["--counter", "7"]).good();
     let (file, bytes) = (room.path("app.cbs"), room.bytes("app.cbs"));
     let (done, kept, writes) = flashed(&file, 0x10000, 0, &["--check-target"]);
-    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    done.says(&[
+        "sealed program of 1024 bytes",
+        "counter 7, signed by ",
+        "verified: CRC",
+        "running: an application",
+    ]);
     assert!(kept == bytes);
     let commands: Vec<&String> = writes.iter().filter(|write| write.starts_with("command")).collect();
     assert_eq!(commands, ["command 80", "command 03", "command 01"]);
-    for words in
-        ["sealed program of 1024 bytes", "counter 7, signed by ", "verified: CRC", "running: an application"]
-    {
-        assert!(done.out.contains(words), "{words}: {}", done.out);
-    }
 
     // The results that the device reports.
     for (status, number, words, advice) in [
@@ -48,26 +46,21 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         (0x8E, "[0x6000018e]", "the device has no key for this program", "coflash seal show"),
     ] {
         let (done, kept, _) = flashed(&file, 0x10000, status, &[]);
-        assert_eq!(done.exit, 6, "{}", done.out);
         assert!(kept == bytes, "it is sent once, and not again");
         // Nothing was erased.
-        let unchanged = "its program is unchanged (CRC 12345678h)";
-        for words in [number, words, advice, unchanged] {
-            assert!(done.err.contains(words), "{words}: {}", done.err);
-        }
+        done.fails(6, &[number, words, advice, "its program is unchanged (CRC 12345678h)"]);
     }
 
     // The refusals that do not need the device's keys: the device is not changed.
-    let small = flashed(&file, 1000, 0, &[]);
-    assert!(small.0.err.contains("the device has room for 1000"), "{}", small.0.err);
-    assert_eq!((small.0.exit, small.2.len()), (6, 0));
-    assert_eq!(room.seal("other.cbs", &["--counter", "7", "--product", "99"]).exit, 0);
-    let other = flashed(&room.path("other.cbs"), 0x10000, 0, &[]);
-    assert!(other.0.err.contains("product code"), "{}", other.0.err);
-    assert_eq!((other.0.exit, other.2.len()), (6, 0));
-    let second = coflash(&["flash", &file, "-P", "2"]);
-    assert!(second.err.contains("it is for program 1, and program 2 is to be written"), "{}", second.err);
-    assert_eq!(second.exit, 3);
+    room.seal("other.cbs", &["--counter", "7", "--product", "99"]).good();
+    for (file, space, words) in
+        [(&file, 1000, "the device has room for 1000"), (&room.path("other.cbs"), 0x10000, "product code")]
+    {
+        let (done, _, writes) = flashed(file, space, 0, &[]);
+        done.fails(6, &[words]);
+        assert!(writes.is_empty(), "{words}: {writes:?}");
+    }
+    coflash(&["flash", &file, "-P", "2"]).fails(3, &["it is for program 1, and program 2 is to be written"]);
     let cut = room.0.file("cut.cbs", &bytes[..bytes.len() - 1]);
     coflash(&["flash", &cut]).fails(3, &["it is cut off"]);
     // In the bootloader already, and in the other dialects of the same objects.
@@ -75,9 +68,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
         let mut fake = Fake::new(BOOTLOADER);
         fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room: 0x10000, status: 0 }));
-        let (bus, server) = serve(fake);
-        coflash(&["flash", &file, "--bus", &bus, "-N", "5", "--dialect", dialect]).good();
-        server.join().unwrap();
+        served(fake, &["flash", &file, "-N", "5", "--dialect", dialect]).0.good();
         assert!(*kept.lock().unwrap() == bytes);
     }
 }
@@ -93,7 +84,7 @@ fn lowest(epoch: u32, counter: u32) -> ((u16, u8), Vec<u8>) {
 fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
     let room = Room::small("old");
     // The key has epoch 3.
-    assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
+    room.seal("app.cbs", &["--counter", "7"]).good();
     let file = room.path("app.cbs");
     let counter = "its security counter is 7, and the device accepts none below 8";
     let epoch = "its certificate has epoch 3, and the device accepts none below 4";
@@ -103,10 +94,7 @@ fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
         (lowest(4, 8), counter, "a higher --counter"),
     ] {
         let (done, fake) = on(BOOTLOADER, Objects::sealed(&program()).but(told), &["flash", &file]);
-        assert_eq!(done.exit, 6, "{}", done.err);
-        for words in [words, advice, "it was not changed", "[0x6000018c]"] {
-            assert!(done.err.contains(words), "{words}: {}", done.err);
-        }
+        done.fails(6, &[words, advice, "it was not changed", "[0x6000018c]"]);
         assert!(!done.err.contains("program is old") && fake.writes().is_empty(), "{}", done.err);
     }
     // A right for a lower counter has been granted; and what the device takes.
@@ -128,8 +116,8 @@ fn what_the_bootloader_alone_has_is_said_with_the_way_there() {
     let root = room.path("root.pem");
     for words in [&["seal", "events"][..], &["seal", "unlock", "erase", "--root", &root]] {
         let (done, fake) = on(APPLICATION, Objects::sealed(&program()), words);
-        assert_eq!((done.exit, fake.writes().len()), (6, 0), "{}", done.err);
-        assert!(done.err.contains("coflash enter"), "{words:?}: {}", done.err);
+        assert_eq!(fake.writes().len(), 0, "{words:?}");
+        done.fails(6, &["coflash enter"]);
         // In the bootloader of a product without sealed images, too, it is the object that is missing.
         let (done, _) = on(BOOTLOADER, Objects { bootloader: Vec::new(), application: Vec::new() }, words);
         done.fails(6, &["without support for sealed images"]);
@@ -152,13 +140,8 @@ fn a_refusal_for_want_of_a_right_names_the_right() {
             false => Outcome::Accept,
         });
         fake.maker = Some(Box::new(Objects::sealed(&program())));
-        let (bus, server) = serve(fake);
-        let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
-        server.join().unwrap();
-        done.fails(6, &["[0x60000184]"]);
-        for way in ["coflash info", "coflash seal image", "coflash seal unlock"] {
-            assert!(done.err.contains(way), "{words:?}, {way}: {}", done.err);
-        }
+        let (done, _) = served(fake, &[words, &["-N", "5"]].concat());
+        done.fails(6, &["[0x60000184]", "coflash info", "coflash seal image", "coflash seal unlock"]);
     }
 }
 
@@ -221,9 +204,7 @@ impl Maker for Objects {
 fn on(running: u32, told: Objects, words: &[&str]) -> (Done, Fake) {
     let mut fake = quick(running);
     fake.maker = Some(Box::new(told));
-    let (bus, server) = serve(fake);
-    let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
-    (done, server.join().unwrap())
+    served(fake, &[words, &["-N", "5"]].concat())
 }
 
 #[test]
@@ -236,7 +217,7 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     for name in ["app.cbs", "app.blk"] {
         let words = ["flash", &room.path(name), "--blocks", "--block-size", "0x110"];
         let (done, fake) = on(APPLICATION, Objects::sealed(program), &words);
-        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+        done.good();
         let (control, carried) = unwrapped(&fake.blocks);
         assert!(carried == image, "{name}");
         assert_eq!(word(&control, 4), VENDOR);
@@ -248,7 +229,7 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     }
     // Without the option the image is sent unchanged, whatever the form of its file.
     let (done, kept, _) = flashed(&room.path("app.blk"), 0x10000, 0, &[]);
-    assert_eq!(done.exit, 0, "{}", done.err);
+    done.good();
     assert!(kept == image);
 
     let file = room.path("app.cbs");
@@ -272,18 +253,11 @@ fn a_device_without_keys_gets_no_sealed_image() {
     let file = room.path("app.cbs");
     let open = || Objects::sealed(&program()).but(challenge(SEALED & 0xFFFF));
     let (done, fake) = on(BOOTLOADER, open(), &["flash", &file]);
-    assert_eq!(done.exit, 6);
-    assert!(
-        done.err.contains("the device is not sealed") && done.err.contains("coflash seal provision"),
-        "{}",
-        done.err
-    );
-    assert!(done.err.contains("it was not changed"), "{}", done.err);
+    done.fails(6, &["the device is not sealed", "coflash seal provision", "it was not changed"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     // An application does not report it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
-    done.fails(6, &["the device is not sealed"]);
-    assert!(done.err.contains("its application is running; it was not changed"), "{}", done.err);
+    done.fails(6, &["the device is not sealed", "its application is running; it was not changed"]);
     assert_eq!(fake.writes(), ["command 80", "command 01"]);
 }
 
@@ -312,7 +286,7 @@ impl Comparison {
     /// The exit code and the JSON of a device in its bootloader.
     fn json(&self, told: Objects) -> (i32, Value) {
         let (done, _) = self.of(BOOTLOADER, told, &["--json"]);
-        (done.exit, serde_json::from_str(&done.out).unwrap())
+        (done.exit, done.json())
     }
 }
 
@@ -335,23 +309,20 @@ fn renewable(state: [u8; 4]) -> Objects {
 fn a_device_is_compared_with_a_sealed_image() {
     let comparison = Comparison::new("verify-device");
     let (done, fake) = comparison.of(BOOTLOADER, same_device(), &[]);
-    let done = done.good();
-    assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
-    assert!(done.out.contains("and does not run it"), "{}", done.out);
+    let done = done.says(&["node 5: holds program 1 of", "and does not run it"]);
     assert!(done.out.ends_with("not reported 2007h/6, 2007h/1\n"), "{}", done.out);
     assert!(fake.writes().is_empty());
 
     // An application does not report all values, and the command says so.
     let (done, _) = comparison.of(APPLICATION, Objects::sealed(&program()), &["--json"]);
-    let value: Value = serde_json::from_str(&done.good().out).unwrap();
+    let value = done.good().json();
     assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
     let unanswered = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
     assert_eq!(value["unanswered"], unanswered);
 
     // A program of which no installation is among the last eight events, and one of another number.
     let forgotten = same_device().but(event(2, [0; 4])).but(event(3, [7, 0x1_0002, 1, 1]));
-    let done = comparison.of(BOOTLOADER, forgotten, &[]).0.good();
-    assert!(done.out.contains("not reported 2003h/1"), "{}", done.out);
+    comparison.of(BOOTLOADER, forgotten, &[]).0.says(&["not reported 2003h/1"]);
 
     // A bad file is refused before a device is asked. For a missing device there is another code.
     let (root, other) = (comparison.room.path("root.pub"), comparison.room.path("release.pub"));
@@ -359,10 +330,9 @@ fn a_device_is_compared_with_a_sealed_image() {
         .fails(3, &["is not one of the given roots"]);
     let mut fake = Fake::new(BOOTLOADER);
     fake.running = None;
-    let (bus, server) = serve(fake);
-    let quick = ["--bus", &bus, "-N", "5", "--sdo-timeout", "20"];
-    coflash(&[&comparison.words(&root)[..], &quick].concat()).fails(5, &[]);
-    server.join().unwrap();
+    served(fake, &[&comparison.words(&root)[..], &["-N", "5", "--sdo-timeout", "20"]].concat())
+        .0
+        .fails(5, &[]);
 }
 
 /// Each difference is named, and each alone is enough.
@@ -439,8 +409,7 @@ fn a_device_that_is_not_ready_fails_the_comparison() {
         comparison.of(BOOTLOADER, renewable(bytes), &[]).0.good();
     }
     // A state of a later version is none that is known to be good.
-    let done = comparison.of(BOOTLOADER, renewable([4, 0, 0, 0]), &[]).0.good();
-    assert!(done.out.contains("not reported 2007h/9"), "{}", done.out);
+    comparison.of(BOOTLOADER, renewable([4, 0, 0, 0]), &[]).0.says(&["not reported 2007h/9"]);
     // RM0090 section 3.9.10: SPRMOD is bit 31 of FLASH_OPTCR, BFB2 bit 4, nWRP bits 16 to 27.
     for (option_bytes, fault) in [(0x8001_AAED, "read_protection"), (0x0FFE_AAFD, "second_bank")] {
         let (exit, value) = comparison.json(renewable([0; 4]).but(number(0x2007, 6, option_bytes)));
@@ -449,8 +418,7 @@ fn a_device_that_is_not_ready_fails_the_comparison() {
     // The protection that it has, and the one that belongs to its product.
     for (renewal, wanted) in [(2, "it needs sector 0 and no others"), (0, "(0 and 4 on the boards")] {
         let told = renewable([0; 4]).but(((0x2007, 1), vec![renewal])).but(number(0x2007, 6, 0x0FEE_AAED));
-        let done = comparison.of(BOOTLOADER, told, &[]).0.good();
-        let line = "  protection   the device has sectors 0, 4; ";
-        assert!(done.out.contains(line) && done.out.contains(wanted), "{}", done.out);
+        let words = ["  protection   the device has sectors 0, 4; ", wanted];
+        comparison.of(BOOTLOADER, told, &[]).0.says(&words);
     }
 }

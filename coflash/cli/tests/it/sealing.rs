@@ -40,7 +40,8 @@ impl Room {
         let image = raw::read(&program(), Some(START)).unwrap();
         room.0.file("app.hex", ihex::emit(&image).as_bytes());
         for role in ["root", "release", "kek"] {
-            room.good(&["seal", "keys", "new", "--role", role, "-o", &room.path(&format!("{role}.pem"))]);
+            coflash(&["seal", "keys", "new", "--role", role, "-o", &room.path(&format!("{role}.pem"))])
+                .good();
         }
         room.certify("release.cert", &[]);
         room
@@ -62,16 +63,11 @@ impl Room {
         fs::read(self.path(name)).unwrap()
     }
 
-    #[track_caller]
-    fn good(&self, words: &[&str]) -> Done {
-        coflash(words).good()
-    }
-
     fn certify(&self, name: &str, more: &[&str]) {
         let (root, key, out) = (self.path("root.pem"), self.path("release.pub"), self.path(name));
         let words =
             ["seal", "keys", "certify", "--root", &root, "--key", &key, "--epoch", "3", "--vendor", "0x3F"];
-        self.good(&[&words[..], &["-o", &out], more].concat());
+        coflash(&[&words[..], &["-o", &out], more].concat()).good();
     }
 
     /// Seals the program as this file.
@@ -89,8 +85,7 @@ impl Room {
 }
 
 fn json(words: &[&str]) -> Value {
-    let done = coflash(&[words, &["--json"]].concat());
-    serde_json::from_str(&done.out).unwrap_or_else(|error| panic!("{error}: {}{}", done.out, done.err))
+    coflash(&[words, &["--json"]].concat()).json()
 }
 
 /// The output of OpenSSL; `None` if it is not installed.
@@ -100,6 +95,13 @@ fn openssl(words: &[&str]) -> Option<Vec<u8>> {
     Some(output.stdout)
 }
 
+/// Who may read and write a file.
+#[cfg(unix)]
+fn mode(path: &str) -> u32 {
+    use std::os::unix::fs::PermissionsExt as _;
+    fs::metadata(path).unwrap().permissions().mode() & 0o777
+}
+
 #[test]
 fn keys_are_made_once_and_are_those_of_openssl() {
     let room = Room::new("keys");
@@ -107,8 +109,7 @@ fn keys_are_made_once_and_are_those_of_openssl() {
     let before = room.bytes("root.pem");
     #[cfg(unix)]
     for name in ["root.pem", "release.pem", "kek.pem"] {
-        use std::os::unix::fs::PermissionsExt as _;
-        assert_eq!(fs::metadata(room.path(name)).unwrap().permissions().mode() & 0o777, 0o600, "{name}");
+        assert_eq!(mode(&room.path(name)), 0o600, "{name}");
     }
     coflash(&["seal", "keys", "new", "--role", "root", "-o", &root]).fails(2, &["exists already"]);
     assert_eq!(room.bytes("root.pem"), before);
@@ -116,7 +117,7 @@ fn keys_are_made_once_and_are_those_of_openssl() {
     fs::remove_file(&root).unwrap();
     assert_eq!(coflash(&["seal", "keys", "new", "--role", "root", "-o", &root]).exit, 2);
     assert!(!Path::new(&root).exists());
-    room.good(&["seal", "keys", "new", "--role", "root", "-o", &root, "--force"]);
+    coflash(&["seal", "keys", "new", "--role", "root", "-o", &root, "--force"]).good();
     assert_ne!(room.bytes("root.pem"), before);
     // With this name both files would have the same path.
     assert_eq!(coflash(&["seal", "keys", "new", "--role", "root", "-o", &room.path("a.pub")]).exit, 2);
@@ -144,7 +145,7 @@ fn keys_and_certificates_are_shown_without_secrets() {
         assert_eq!((&shown["kind"], &shown["id"]), (&kind.into(), &id.into()));
     }
     let kek = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
-    let shown = room.good(&["seal", "keys", "show", &room.path("kek.pem")]);
+    let shown = coflash(&["seal", "keys", "show", &room.path("kek.pem")]).good();
     assert_eq!(shown.out, format!("{}: key-encryption key {:08X}h\n", room.path("kek.pem"), kek.id()));
     room.certify("test.cert", &["--role", "test", "--product", "1234", "--lowest", "2", "--highest", "5"]);
     let shown = json(&["seal", "keys", "show", &room.path("test.cert")]);
@@ -168,7 +169,7 @@ fn keys_and_certificates_are_shown_without_secrets() {
 fn a_value_of_128_bits_makes_a_key() {
     let room = Room::new("value");
     let (value, out) = ("000102030405060708090a0b0c0d0e0f", room.path("product.pem"));
-    room.good(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &out]);
+    coflash(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &out]).good();
     let text = room.0.file("text", b"coboot key of a value 1\0");
     let option = format!("hexkey:{value}");
     if let Some(mac) = openssl(&["dgst", "-sha512", "-binary", "-mac", "HMAC", "-macopt", &option, &text]) {
@@ -177,11 +178,8 @@ fn a_value_of_128_bits_makes_a_key() {
     }
     for (role, value) in [("kek", "0001"), ("kek", "zz"), ("root", value)] {
         let out = room.path("none.pem");
-        assert_eq!(
-            coflash(&["seal", "keys", "new", "--role", role, "--of-value", value, "-o", &out]).exit,
-            2
-        );
-        assert!(!Path::new(&out).exists());
+        let done = coflash(&["seal", "keys", "new", "--role", role, "--of-value", value, "-o", &out]);
+        assert!(done.exit == 2 && !Path::new(&out).exists(), "{role}, {value}: {}", done.err);
     }
 }
 
@@ -198,17 +196,16 @@ fn the_converter_encrypts_with_a_value() {
         (&["--sign", &sign], ", and --counter is missing"),
     ] {
         let done = coflash(&[&words[..], more].concat());
-        assert_eq!(done.exit, 2);
-        assert!(done.err.contains(missing) && done.err.contains("what to do: give --sign"), "{}", done.err);
+        done.fails(2, &[missing, "what to do: give --sign"]);
         assert!(!done.err.contains(value), "the value is a secret");
         assert!(!Path::new(&room.path("app.blk")).exists());
     }
     let signed = [&words[..], &["--sign", &sign, "--cert", &cert, "--counter", "7"]].concat();
-    let done = room.good(&[&signed[..], &["--add", "0xA5"]].concat());
-    assert!(done.out.contains("app.blk: program 1 V1.10r100, counter 7, 9001 bytes"), "{}", done.out);
-    assert!(done.err.contains("--add has no effect"), "{}", done.err);
+    coflash(&[&signed[..], &["--add", "0xA5"]].concat())
+        .says(&["app.blk: program 1 V1.10r100, counter 7, 9001 bytes"])
+        .fails(0, &["--add has no effect"]);
     let kek = room.path("product.pem");
-    room.good(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
+    coflash(&["seal", "keys", "new", "--role", "kek", "--of-value", value, "-o", &kek]).good();
     assert!(room.verify("app.blk", &["--kek", &kek]).out.contains("the program is whole, 9001 bytes"));
     assert!(room.verify("app.blk", &["--kek", &room.path("kek.pem")]).err.contains("for other keys"));
     let shown = json(&["seal", "show", &room.path("app.blk")]);
@@ -218,10 +215,10 @@ fn the_converter_encrypts_with_a_value() {
     let first = room.bytes("app.blk");
     let has = |part: &[u8]| first.windows(part.len()).any(|bytes| bytes == part);
     assert!(program()[0x300..].chunks_exact(32).all(|plain| !has(plain)));
-    room.good(&signed);
+    coflash(&signed).good();
     assert_eq!(room.bytes("app.blk"), first, "the same input, the same file");
     // The image is the same as that of `seal`.
-    room.good(&[&["convert", &app, &room.path("own.cbs")], &signed[2..]].concat());
+    coflash(&[&["convert", &app, &room.path("own.cbs")], &signed[2..]].concat()).good();
     room.seal("sealed.cbs", &["--counter", "7", "--encrypt", &kek]);
     assert_eq!(room.bytes("own.cbs"), room.bytes("sealed.cbs"));
     // The command line sets another identity, and the certificate is checked against it.
@@ -299,17 +296,15 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
         let words = [size, VENDOR, PRODUCT, 0x0064_0A01, 1_420_070_400, 0];
         assert_eq!(control, words.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<u8>>());
         // The file counts as the image that is in its blocks.
-        let verified = room.verify(name, &["--product", "1234"]);
-        assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.err);
+        room.verify(name, &["--product", "1234"]).says(&["the program is whole, 9001 bytes"]);
         let shown = json(&["seal", "show", &room.path(name)]);
         assert_eq!((&shown["format"], &shown["counter"]), (&"sealed image".into(), &7.into()));
         assert_eq!(shown["blocks"]["count"], blocks.len());
         assert_eq!(shown["blocks"]["crc"], crc32(&image));
         for command in [&["seal", "show"][..], &["inspect"]] {
-            let words = room.good(&[command, &[&room.path(name)]].concat()).out;
-            let front =
-                format!("block file, {} blocks, from 0x08010000 on; in it: sealed image", blocks.len());
-            assert!(words.contains(&front) && words.contains("counter      7"), "{words}");
+            let front = format!("file, {} blocks, from 0x08010000 on; in it: sealed image", blocks.len());
+            let words = [&format!("block {front}")[..], "counter      7"];
+            coflash(&[command, &[&room.path(name)]].concat()).says(&words);
         }
         coflash(&["convert", &room.path(name), &room.path("x.blk")]).fails(3, &["is a sealed image"]);
     }
@@ -318,7 +313,7 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
     let (app, key) = (room.path("app.hex"), room.path("release.pem"));
     let words =
         ["seal", "image", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
-    room.good(&[&words[..], &["--blocks"]].concat());
+    coflash(&[&words[..], &["--blocks"]].concat()).good();
     assert!(room.bytes("app.blk").len() > image.len());
     coflash(&[&words[..], &["--blocks", "20"]].concat()).fails(2, &["a block size of 20 is impossible"]);
     // Every command reports an error in the blocks.
@@ -341,9 +336,7 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
             &["seal", "verify-device", &file, "--root", &root],
             &["flash", &file],
         ] {
-            let done = coflash(command);
-            assert_eq!(done.exit, 3, "{command:?}: {}", done.err);
-            assert!(done.err.contains(words) && done.err.contains(number), "{}", done.err);
+            coflash(command).fails(3, &[words, number]);
         }
     }
 }
@@ -366,14 +359,14 @@ fn a_program_is_sealed_shown_and_verified() {
         (&shown["size"], &shown["payload"], &shown["chunk"]),
         (&9001.into(), &9001.into(), &4096.into())
     );
-    let words = room.good(&["seal", "show", &room.path("app.cbs")]).out;
-    assert!(words.contains("vendor-ID 0000003Fh, product code 000004D2h"), "{words}");
+    let identity = "vendor-ID 0000003Fh, product code 000004D2h";
+    let words = coflash(&["seal", "show", &room.path("app.cbs")]).says(&[identity]).out;
     // `inspect` recognises it, too, and no other command takes it for another format.
-    assert_eq!(room.good(&["inspect", &room.path("app.cbs")]).out, words);
+    assert_eq!(coflash(&["inspect", &room.path("app.cbs")]).good().out, words);
     coflash(&["convert", &room.path("app.cbs"), &room.path("x.blk")]).fails(3, &["is a sealed image"]);
 
-    let verified = room.verify("app.cbs", &["--product", "1234", "--counter", "7", "--epoch", "3"]).good();
-    assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.out);
+    room.verify("app.cbs", &["--product", "1234", "--counter", "7", "--epoch", "3"])
+        .says(&["the program is whole, 9001 bytes"]);
     for (more, words, number) in [
         (&["--product", "1"][..], "it is for product code 000004D2h", "0x60000182"),
         (&["--vendor", "1"], "it is for vendor-ID 0000003Fh", "0x60000180"),
@@ -382,18 +375,15 @@ fn a_program_is_sealed_shown_and_verified() {
         (&["--epoch", "4"], "its certificate has epoch 3", "0x6000018c"),
         (&["--room", "9000"], "the program has 9001 bytes", "0x60000006"),
     ] {
-        let done = room.verify("app.cbs", more);
-        assert_eq!(done.exit, 3, "{more:?}");
-        assert!(done.err.contains(words) && done.err.contains(number), "{}", done.err);
-        assert!(done.err.contains("what to do: "), "{}", done.err);
+        room.verify("app.cbs", more).fails(3, &[words, number, "what to do: "]);
     }
     let mut damaged = first.clone();
     *damaged.last_mut().unwrap() ^= 1;
     let file = room.0.file("damaged.cbs", &damaged);
-    let done = coflash(&["seal", "verify", &file, "--root", &room.path("root.pub")]);
-    assert!(done.err.contains("chunk 3 of 3") && done.err.contains("[0x6000018a]"), "{}", done.err);
-    let done = coflash(&["seal", "verify", &room.path("app.cbs"), "--root", &room.path("release.pub")]);
-    assert!(done.err.contains("is not one of the given roots [0x6000018e]"), "{}", done.err);
+    coflash(&["seal", "verify", &file, "--root", &room.path("root.pub")])
+        .fails(3, &["chunk 3 of 3", "[0x6000018a]"]);
+    coflash(&["seal", "verify", &room.path("app.cbs"), "--root", &room.path("release.pub")])
+        .fails(3, &["is not one of the given roots [0x6000018e]"]);
     for (name, bytes) in [("empty.cbs", &b""[..]), ("cut.cbs", &first[..600]), ("magic.cbs", b"CBS1")] {
         let file = room.0.file(name, bytes);
         for words in [
@@ -417,13 +407,10 @@ fn encrypted_and_compressed_programs_come_out_again() {
     assert_eq!(shown["flags"], serde_json::json!(["encrypted", "compressed"]));
     assert_eq!(shown["text"], "for all");
     assert!(shown["payload"].as_u64() < shown["size"].as_u64());
-    let closed = room.verify("app.cbs", &[]);
-    assert!(closed.out.contains("give --kek"), "{}{}", closed.out, closed.err);
-    let whole = room.verify("app.cbs", &["--kek", &kek]);
-    assert!(whole.out.contains("the program is whole, 9001 bytes"), "{}{}", whole.out, whole.err);
+    room.verify("app.cbs", &[]).says(&["give --kek"]);
+    room.verify("app.cbs", &["--kek", &kek]).says(&["the program is whole, 9001 bytes"]);
     let other = room.0.file("other.kek", "5a".repeat(32).as_bytes());
-    let done = room.verify("app.cbs", &["--kek", &other]);
-    assert!(done.err.contains("encrypted for other keys"), "{}", done.err);
+    room.verify("app.cbs", &["--kek", &other]).fails(3, &["encrypted for other keys"]);
 
     // Against the other program, for one device, with everything else.
     let old = room.0.file("old.bin", &program()[..8000]);
@@ -440,11 +427,9 @@ fn encrypted_and_compressed_programs_come_out_again() {
     }
     assert!(room.verify("app.cbs", &[]).out.contains("give --base"));
     assert!(room.verify("app.cbs", &["--base", &old]).out.contains("is whole"));
-    let done = room.verify("app.cbs", &["--base", &room.path("app.hex")]);
-    assert!(done.err.contains("is not the given program"), "{}", done.err);
-    let done = room.verify("app.cbs", &["--device", "000102030405060708090a0b"]);
-    assert!(done.err.contains("another unique ID"), "{}", done.err);
-    assert_eq!(room.verify("app.cbs", &["--hardware", "2"]).exit, 3);
+    room.verify("app.cbs", &["--base", &room.path("app.hex")]).fails(3, &["is not the given program"]);
+    room.verify("app.cbs", &["--device", "000102030405060708090a0b"]).fails(3, &["another unique ID"]);
+    room.verify("app.cbs", &["--hardware", "2"]).fails(3, &[]);
 
     // For tests.
     room.certify("release.cert", &["--role", "test"]);
@@ -475,13 +460,8 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     let words =
         ["seal", "image", &junk, "-I", "binary", "--board", "nucleo-f446re", "--key", &key, "--counter", "1"];
     assert!(coflash(&words).err.contains("is not a program"));
-    let done = coflash(&[&words[..], &["--data"]].concat());
-    assert!(
-        done.err.contains("the program has no vendor-ID of its target device")
-            && done.err.contains("give --vendor"),
-        "{}",
-        done.err
-    );
+    coflash(&[&words[..], &["--data"]].concat())
+        .fails(2, &["the program has no vendor-ID of its target device", "give --vendor"]);
     coflash(&[&words[..], &["--data", "--vendor", "1", "--product", "2"]].concat()).good();
     assert_eq!(json(&["seal", "show", &room.path("junk.cbs")])["flags"], serde_json::json!(["data"]));
     // A sealed image is not sealed again, and not overwritten.
@@ -497,10 +477,8 @@ fn a_module_signs_in_two_steps() {
     let (key, cert, tbs) = (room.path("release.pub"), room.path("release.cert"), room.path("app.tbs"));
     let words =
         ["seal", "image", &app, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert, "--counter", "1"];
-    let done = room.good(&[&words[..], &["--tbs", &tbs]].concat());
-    assert!(done.out.contains("its signature is missing"), "{}", done.out);
-    let done = room.verify("app.cbs", &[]);
-    assert!(done.err.contains("its signature is wrong"), "{}", done.err);
+    coflash(&[&words[..], &["--tbs", &tbs]].concat()).says(&["its signature is missing"]);
+    room.verify("app.cbs", &[]).fails(3, &["its signature is wrong"]);
     let wrong = room.0.file("wrong.sig", &[0; 64]);
     coflash(&["seal", "image", &out, "--key", &key, "--attach", &wrong])
         .fails(3, &["this is not a signature of the key"]);
@@ -518,8 +496,8 @@ fn a_module_signs_in_two_steps() {
     // In blocks, if their addresses are known.
     let attach = ["seal", "image", &out, "--key", &key, "--attach", &signature];
     coflash(&[&attach[..], &["--blocks"]].concat()).fails(2, &["give --board"]);
-    room.good(&[&attach[..], &["--blocks", "--board", "nucleo-f446re"]].concat());
-    room.good(&attach);
+    coflash(&[&attach[..], &["--blocks", "--board", "nucleo-f446re"]].concat()).good();
+    coflash(&attach).good();
     assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
     assert!(unwrapped(&split(&room.bytes("app.blk"))).1 == room.bytes("app.cbs"));
     // OpenSSL accepts the tool's own signature.
@@ -569,17 +547,14 @@ fn a_bootloader_gets_its_keys() {
     let block: [u8; 256] = image.bytes(LAYOUT.key_block().base).unwrap();
     assert_eq!(image.byte_count(), 992 + 16 + 256);
     // The sectors of RM0090 table 5 at 08000000h and 08010000h.
-    let words =
-        "option bytes         write protection (nWRP) of sectors 0, 4 and of no others, SPRMOD 0, BFB2 0";
-    assert!(done.out.contains(words), "{}", done.out);
+    done.says(&[
+        "option bytes         write protection (nWRP) of sectors 0, 4 and of no others, SPRMOD 0, BFB2 0",
+    ]);
     assert_eq!(block[..16], *b"CBKB\x01\0\0\0\x07\0\0\0\x02\0\0\0");
     let public = PublicKey::from_pem(&String::from_utf8(room.bytes("root.pub")).unwrap()).unwrap();
     assert_eq!(block[20..52], public.bytes());
     #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        assert_eq!(fs::metadata(&out).unwrap().permissions().mode() & 0o777, 0o600);
-    }
+    assert_eq!(mode(&out), 0o600);
     for (more, exit, words) in [
         (&["-o", &out][..], 2, "exists already"),
         (&["-o", &room.path("x.bin")], 2, "name it with .hex"),
@@ -632,14 +607,13 @@ fn a_bootloader_is_sealed_by_a_key_for_bootloaders() {
         ["seal", "keys", "certify", "--root", &root, "--key", &room.path("release.pub"), "--epoch", "1"];
     let certify = [&certify[..], &["--vendor", "0x3F", "-o", &cert]].concat();
     let seal = ["seal", "image", &file, "-o", &out, "--bootloader", "--key", &key, "--cert", &cert];
-    room.good(&[&certify[..], &["--role", "release"]].concat());
+    coflash(&[&certify[..], &["--role", "release"]].concat()).good();
     let done = coflash(&seal);
     assert_eq!(done.exit, 3, "a key for programs: {}", done.err);
     fs::remove_file(&cert).unwrap();
-    room.good(&[&certify[..], &["--role", "bootloader"]].concat());
+    coflash(&[&certify[..], &["--role", "bootloader"]].concat()).good();
     assert_eq!(json(&["seal", "keys", "show", &cert])["role"], "bootloader");
-    let done = room.good(&seal);
-    assert!(done.out.contains("counter 3, 4160 bytes"), "{}", done.out);
+    coflash(&seal).says(&["counter 3, 4160 bytes"]);
     let shown = json(&["seal", "show", &out]);
     assert_eq!((&shown["program"], &shown["counter"]), (&255.into(), &3.into()));
     assert!(room.verify("boot.cbs", &[]).out.contains("4160 bytes"));

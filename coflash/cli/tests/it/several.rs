@@ -5,7 +5,7 @@ use std::fs;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::tool::{coflash, data, folder, quick};
+use crate::tool::{bootloader, coflash, data, folder, quick, served, within, NOWHERE};
 use canopen::{CobId, Frame};
 use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
@@ -26,10 +26,8 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
     let folder = folder("several");
     let report = folder.path("report.json");
     let file = data("plain-400.blk");
-    let (url, server) = serve(bus());
-    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5,9-10", "--report", &report]);
+    let (done, bus_after) = served(bus(), &["flash", &file, "--node", "5,9-10", "--report", &report]);
     assert_eq!(done.exit, 8, "{}", done.err);
-    let bus_after = server.join().unwrap();
     assert_eq!(bus_after.0[0].blocks.concat(), fs::read(&file).unwrap());
     assert_eq!(bus_after.0[2].blocks.concat(), fs::read(&file).unwrap());
     for words in [
@@ -43,12 +41,10 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
         assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
     }
     assert_eq!(done.err, "error: 1 of 3 devices failed\n");
-    let (url, _server) = serve(bus());
-    let json = coflash(&["--json", "--bus", &url, "flash", &file, "--node", "5,9-10"]);
+    let (json, _) = served(bus(), &["--json", "flash", &file, "--node", "5,9-10"]);
     assert_eq!((json.exit, json.err.as_str()), (8, ""));
     let written: Value = serde_json::from_str(&fs::read_to_string(&report).unwrap()).unwrap();
-    let said: Value = serde_json::from_str(&json.out).unwrap();
-    for document in [&written, &said] {
+    for document in [&written, &json.json()] {
         assert_eq!((&document["failed"], &document["devices"][0]["ok"]), (&1.into(), &true.into()));
         assert_eq!(document["devices"][1]["error"]["number"], "0x60000007");
         assert_eq!(document["devices"][1]["error"]["device"], "erased");
@@ -69,10 +65,9 @@ fn a_job_file_says_who_gets_what() {
         b"[[program]]\nimage = 'plain.blk'\nnodes = [5]\n[[program]]\nimage = 'small.hex'\nnodes = [6]\n\
           start = false\n[[program]]\nimage = 'plain.blk'\nnodes = [7]\ntrial-run = false\n",
     );
-    let (url, server) =
-        serve(Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]));
-    let done = coflash(&["--bus", &url, "flash", "--job", &job, "--at-once", "2"]).good();
-    let bus = server.join().unwrap();
+    let bus = Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]);
+    let (done, bus) = served(bus, &["flash", "--job", &job, "--at-once", "2"]);
+    let done = done.good();
     let plain = fs::read(data("plain-400.blk")).unwrap();
     assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
     // Block 0 and the last one around one of 516 bytes, after whose header of 12 bytes they are.
@@ -84,11 +79,10 @@ fn a_job_file_says_who_gets_what() {
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
     // With an invalid image, no device is changed.
     fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
-    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job])
-        .fails(3, &["small.hex: is not a program: it does not begin"]);
+    let flash = ["--bus", NOWHERE, "flash", "--job", &job];
+    coflash(&flash).fails(3, &["small.hex: is not a program: it does not begin"]);
     fs::write(small, b"hello").unwrap();
-    coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job])
-        .fails(3, &["small.hex: is not a firmware file"]);
+    coflash(&flash).fails(3, &["small.hex: is not a firmware file"]);
     coflash(&["flash", "--job", &job, "--node", "5"]).fails(2, &["cannot be used with"]);
 }
 
@@ -176,27 +170,23 @@ fn a_device_without_node_id_gets_one_by_its_lss_address() {
         );
         folder.file("job.toml", text.as_bytes())
     };
-    let (url, server) = serve(unconfigured());
-    coflash(&["--bus", &url, "flash", "--job", &job("nodes = [9]", 7)]).good();
-    let bus = server.join().unwrap();
+    let by_job = |nodes, serial| served(unconfigured(), &["flash", "--job", &job(nodes, serial)]);
+    let (done, bus) = by_job("nodes = [9]", 7);
+    done.good();
     assert_eq!((bus.fake.node, bus.fake.blocks.concat()), (9, fs::read(&file).unwrap()));
     // The manual's options (table 9).
-    let (url, server) = serve(unconfigured());
     let legacy = ["--ser_num", "7", "--rev", "0x10000", "--pcode", "2", "--vendor", "0x3F"];
-    coflash(&[&["--bus", &url, "flash", "-N", "12", &file][..], &legacy].concat()).good();
-    assert_eq!(server.join().unwrap().fake.node, 12);
-    for (node, serial, words) in [
+    let (done, bus) = served(unconfigured(), &[&["flash", "-N", "12", &file][..], &legacy].concat());
+    done.good();
+    assert_eq!(bus.fake.node, 12);
+    let nobody = "node 9: error: no device answers (selecting the device by its LSS address) [0x60000013]";
+    for (nodes, serial, words) in [
         ("", 7, "device with serial number 00000007h: error: the device has no node-ID [0x60000017]"),
-        (
-            "nodes = [9]",
-            5,
-            "node 9: error: no device answers (selecting the device by its LSS address) [0x60000013]",
-        ),
+        ("nodes = [9]", 5, nobody),
     ] {
-        let (url, server) = serve(unconfigured());
-        let done = coflash(&["--bus", &url, "flash", "--job", &job(node, serial)]);
+        let (done, bus) = by_job(nodes, serial);
         assert!(done.exit == 8 && done.out.contains(words), "{}{}", done.out, done.err);
-        assert!(server.join().unwrap().fake.blocks.is_empty());
+        assert!(bus.fake.blocks.is_empty());
     }
 }
 
@@ -237,9 +227,7 @@ fn a_bus_with_nobody_but_the_tool_is_told() {
     ] {
         let mut fake = device(5, BOOTLOADER);
         fake.running = None;
-        let (url, server) = serve(Mirror { fake, back: VecDeque::new() });
-        let done = coflash(&[&["--bus", &url][..], &command].concat());
-        server.join().unwrap();
+        let (done, _) = served(Mirror { fake, back: VecDeque::new() }, &command);
         let said = format!("{}{}", done.out, done.err);
         assert_eq!(done.exit, exit, "{said}");
         assert!(said.contains("the server returns our own frames, and no other node has sent any"), "{said}");
@@ -261,11 +249,7 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     {
         let (slow, heard) = slow();
         let (url, server) = serve(slow);
-        let tool = crate::tool::command();
-        let mut command = Command::new("nohup");
-        command
-            .envs(tool.get_envs().filter_map(|(name, value)| Some((name, value?))))
-            .arg(tool.get_program());
+        let mut command = within("nohup", &[]);
         command.args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]);
         let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         while heard.recv().unwrap() != 1 {}
@@ -279,7 +263,7 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
 /// A device that reports its blocks; the first takes some time, so that a signal comes meanwhile.
 #[cfg(unix)]
 fn slow() -> (Fake, std::sync::mpsc::Receiver<u32>) {
-    let mut slow = device(5, BOOTLOADER);
+    let mut slow = bootloader();
     let (reported, heard) = std::sync::mpsc::channel();
     slow.on_block = Box::new(move |block| {
         let _ = reported.send(block);
@@ -339,7 +323,7 @@ fn an_interruption_ends_in_order(folder: &str, signals: &[&str]) {
     );
     // The update can be repeated.
     fake.on_block = Box::new(|_| Outcome::Accept);
-    let (url, server) = serve(fake);
-    coflash(&["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]).good();
-    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+    let (done, fake) = served(fake, &["flash", "-N", "5", &data("identity-110.blk")]);
+    done.good();
+    assert_eq!(fake.running, Some(APPLICATION));
 }

@@ -114,23 +114,15 @@ fn a_library_that_lies_is_named_and_stops_nothing() {
                 let Some((bus, lie, exit, words)) = row else { return };
                 let folder = if bus.starts_with("peak") { &peak } else { &kvaser };
                 let done = call(folder, lie, &[&["--bus", *bus][..], &READ, &["2"]].concat());
-                assert_eq!(done.exit, *exit, "{bus}, {lie}: {}", done.err);
-                for words in *words {
-                    assert!(done.err.contains(words), "{bus}, {lie}: '{words}' is not in\n{}", done.err);
-                }
+                done.fails(*exit, words);
             });
         }
     });
     // An adapter that accepts no more frames.
     for (folder, bus) in [(&peak, "peak:PCAN_USBBUS1@500k"), (&kvaser, "kvaser:0@500k")] {
         let patient = ["read", "1000", "-N", "5", "--sdo-timeout", "20000"];
-        let done = call(folder, "full", &[&["--bus", bus][..], &patient].concat());
-        assert_eq!(done.exit, 4, "{}", done.err);
-        assert!(
-            done.err.contains("accepts no more frames") && done.err.contains("0x60000305"),
-            "{}",
-            done.err
-        );
+        call(folder, "full", &[&["--bus", bus][..], &patient].concat())
+            .fails(4, &["accepts no more frames", "0x60000305"]);
     }
 }
 
@@ -155,15 +147,11 @@ fn a_library_that_is_missing_or_old_is_named_with_where_to_get_it() {
         ),
         (&old.1, "kvaser:0@500k", &["libcanlib.so.1 has no function canReadStatus", "it is too old"]),
     ] {
-        let done = call(folder, "", &[&["--bus", bus][..], &READ, &["1"]].concat());
-        assert_eq!(done.exit, 4, "{}", done.err);
-        for words in words {
-            assert!(done.err.contains(words), "'{words}' is not in\n{}", done.err);
-        }
+        call(folder, "", &[&["--bus", bus][..], &READ, &["1"]].concat()).fails(4, words);
     }
     // The list has all others, and the reason why these are missing.
     let done = call(&broken, "", &["adapters", "--json"]);
-    let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+    let json = done.json();
     assert_eq!((done.exit, json["adapters"].as_array().unwrap().len()), (0, 0));
     assert_eq!(json["not_looked_for"][0]["kind"], "peak");
     assert!(json["not_looked_for"][1]["advice"].as_str().unwrap().contains("www.kvaser.com"));
@@ -173,9 +161,8 @@ fn a_library_that_is_missing_or_old_is_named_with_where_to_get_it() {
 fn adapters_are_listed_and_the_only_one_is_taken() {
     let (peak, kvaser) = (vendor("peak-list", "peak", &[]), vendor("kvaser-list", "kvaser", &[]));
     let urls = |folder: &Folder, lie: &str| {
-        let done = call(folder, lie, &["adapters", "--json"]).good();
-        let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
-        let adapters = json["adapters"].as_array().unwrap().clone();
+        let json = call(folder, lie, &["adapters", "--json"]).good().json();
+        let adapters = json["adapters"].as_array().unwrap();
         adapters.iter().map(|one| one["bus"].as_str().unwrap().to_string()).collect::<Vec<_>>()
     };
     assert_eq!(urls(&peak, ""), ["peak:PCAN_USBBUS1"]);
@@ -197,12 +184,8 @@ fn adapters_are_listed_and_the_only_one_is_taken() {
         let done = flash(folder, "", &[], &["-B", "2"]);
         assert!(done.err.contains(words), "{}", done.err);
     }
-    let done = call(&peak, "two", &["scan"]);
-    assert_eq!(done.exit, 2, "{}", done.err);
-    for words in ["several adapters", "peak:PCAN_USBBUS1", "peak:PCAN_USBBUS2", "give one of them with --bus"]
-    {
-        assert!(done.err.contains(words), "{}", done.err);
-    }
+    let words = ["several adapters", "peak:PCAN_USBBUS1", "peak:PCAN_USBBUS2", "give one of them with --bus"];
+    call(&peak, "two", &["scan"]).fails(2, &words);
     run(command(&peak, "", &["scan"])
         .env("LD_LIBRARY_PATH", Path::new("/nowhere"))
         .env("COFLASH_SEARCH", "none"))

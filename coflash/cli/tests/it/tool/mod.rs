@@ -7,8 +7,10 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use kit::fake::{Blocks, Fake, BOOTLOADER};
+use coboot_can::Adapter;
+use kit::fake::{serve, Blocks, Fake, BOOTLOADER};
 use kit::folder::Folder;
+use serde_json::Value;
 
 /// A device without long delays.
 pub fn quick(running: u32) -> Fake {
@@ -18,14 +20,21 @@ pub fn quick(running: u32) -> Fake {
     fake
 }
 
-/// A bootloader that takes block transfers.
-pub fn bootloader() -> Fake {
-    let mut fake = quick(BOOTLOADER);
-    fake.knows_blocks = Blocks::Known(127);
+/// Such a device with something changed.
+pub fn device(running: u32, change: impl FnOnce(&mut Fake)) -> Fake {
+    let mut fake = quick(running);
+    change(&mut fake);
     fake
 }
 
+/// A bootloader that takes block transfers.
+pub fn bootloader() -> Fake {
+    device(BOOTLOADER, |fake| fake.knows_blocks = Blocks::Known(127))
+}
+
 pub struct Done {
+    /// The command with its words and variables.
+    call: String,
     pub exit: i32,
     pub out: String,
     pub err: String,
@@ -35,20 +44,37 @@ impl Done {
     /// Checks that the command has succeeded.
     #[track_caller]
     pub fn good(self) -> Self {
-        assert_eq!(self.exit, 0, "{}{}", self.out, self.err);
+        self.ends(0, "", &[]);
+        self
+    }
+
+    /// Checks that the command has succeeded, with all these words on standard output.
+    #[track_caller]
+    pub fn says(self, words: &[&str]) -> Self {
+        self.ends(0, &self.out, words);
         self
     }
 
     /// Checks that the command has failed with this exit code and all these words.
     #[track_caller]
     pub fn fails(&self, exit: i32, words: &[&str]) {
-        let Self { out, err, .. } = self;
-        let missing: Vec<&&str> = words.iter().filter(|words| !err.contains(**words)).collect();
+        self.ends(exit, &self.err, words);
+    }
+
+    #[track_caller]
+    fn ends(&self, exit: i32, text: &str, words: &[&str]) {
+        let Self { call, exit: found, out, err } = self;
+        let missing: Vec<&&str> = words.iter().filter(|words| !text.contains(**words)).collect();
         assert!(
-            self.exit == exit && missing.is_empty(),
-            "{} and not {exit}, {missing:?}: {out}{err}",
-            self.exit
+            *found == exit && missing.is_empty(),
+            "{call}: {found} and not {exit}, {missing:?}: {out}{err}"
         );
+    }
+
+    /// The document on standard output.
+    #[track_caller]
+    pub fn json(&self) -> Value {
+        serde_json::from_str(&self.out).unwrap_or_else(|error| panic!("{error}: {}{}", self.out, self.err))
     }
 }
 
@@ -67,19 +93,35 @@ pub fn command() -> Command {
     command
 }
 
+/// The tool, started by another program with these arguments.
+#[cfg(unix)]
+pub fn within(program: &str, arguments: &[&str]) -> Command {
+    let tool = command();
+    let mut outer = Command::new(program);
+    outer.args(arguments).arg(tool.get_program());
+    outer.envs(tool.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    outer
+}
+
+/// A bus with a valid URL that does not exist.
+pub const NOWHERE: &str = "socketcand://127.0.0.1:1/x";
+
 pub fn coflash(arguments: &[&str]) -> Done {
     run(command().args(arguments))
 }
 
-/// Runs the tool with the words of a line, none of which has a blank in it.
-pub fn typed(line: &str) -> Done {
-    run(command().args(line.split(' ')))
+/// Runs the tool with these words on the bus of a device; gives the device, too.
+pub fn served<A: Adapter + Send + 'static>(fake: A, words: &[&str]) -> (Done, A) {
+    let (bus, server) = serve(fake);
+    let done = coflash(&[&["--bus", &bus], words].concat());
+    (done, server.join().unwrap())
 }
 
 pub fn run(command: &mut Command) -> Done {
     let done = command.output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    Done { exit: done.status.code().expect("no signal"), out: text(done.stdout), err: text(done.stderr) }
+    let exit = done.status.code().expect("no signal");
+    Done { call: format!("{command:?}"), exit, out: text(done.stdout), err: text(done.stderr) }
 }
 
 pub fn data(name: &str) -> String {
