@@ -2,7 +2,6 @@
 
 use std::fmt::Display;
 
-use coboot_can::AdapterError;
 use coflash_core::advice::{Advice, Front};
 use coflash_core::file::FileError;
 
@@ -20,11 +19,6 @@ pub(super) fn with_advice(text: impl Display, advice: impl IntoIterator<Item = A
 /// The fault of a file.
 pub(super) fn of_file(error: &FileError) -> String {
     with_advice(error, error.error.cause.advice())
-}
-
-/// What to do about an adapter.
-pub(super) fn of_adapter(error: &AdapterError) -> String {
-    on_page(&error.into())
 }
 
 #[cfg(test)]

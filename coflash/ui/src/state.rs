@@ -359,11 +359,6 @@ impl State {
         }
         self.reports.push(report);
     }
-
-    /// The number of the next run.
-    pub(super) fn next_run(&self) -> u64 {
-        self.reports.last().map_or(1, |report| report.run + 1)
-    }
 }
 
 impl Device {

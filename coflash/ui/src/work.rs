@@ -216,7 +216,7 @@ fn report(
     took: Duration,
 ) {
     shared.change(|state| {
-        let run = state.next_run();
+        let run = state.reports.last().map_or(1, |report| report.run + 1);
         for (node, result) in nodes.iter().zip(results) {
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get())).cloned();
             let words = match result {

@@ -111,7 +111,7 @@ fn open(shared: &Shared, url: String, sdo_ids: Option<SdoBases>) -> Bus {
         Err(error) => {
             shared.change(|state| {
                 state.adapter.state = Connection::Closed;
-                state.notice(Notice::failed(error.to_string(), advice::of_adapter(&error)));
+                state.notice(Notice::failed(error.to_string(), advice::on_page(&(&error).into())));
             });
             Bus::Closed
         }

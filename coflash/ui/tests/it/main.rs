@@ -40,6 +40,13 @@ impl Ui {
         Self::with(|options| options.bus = bus)
     }
 
+    /// With this bus, whose adapter is open.
+    fn on(bus: String) -> Self {
+        let ui = Self::new(Some(bus));
+        ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+        ui
+    }
+
     fn with(change: impl FnOnce(&mut Options)) -> Self {
         let mut options = Options::default();
         change(&mut options);
@@ -103,8 +110,7 @@ fn without_the_token_nothing_is_told() {
         assert_eq!(answer.status, 403, "{path}: {}", answer.body);
         assert!(!answer.body.contains(token), "{path}");
     }
-    let (cookie, other) = (format!("Cookie: coflash={token}"), format!("Authorization: Bearer {token}"));
-    for line in [cookie, other] {
+    for line in [format!("Cookie: coflash={token}"), format!("Authorization: Bearer {token}")] {
         assert_eq!(ui.request("GET", "/events", &[&host, &line], b"").status, 403, "{line}");
     }
     assert_eq!(ui.request("POST", "/scan", &[&host], b"{}").status, 403);
@@ -307,12 +313,9 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
         (b"\x7fELF", "page.hex"),
         (b":zz", "page.hex, line 1"),
     ] {
-        let answer = ui.file("page.hex", bytes);
-        assert_eq!(answer.status, 422, "{}", answer.body);
-        assert!(answer.json()["words"].as_str().unwrap().starts_with(words), "{}", answer.body);
+        refuses(&ui, "page.hex", bytes, words);
     }
-    let empty = ui.file("e.hex", b"");
-    assert_eq!((empty.status, empty.json()["words"].as_str().unwrap()), (422, "e.hex: is empty"));
+    assert_eq!(refuses(&ui, "e.hex", b"", "e.hex")["words"], "e.hex: is empty");
     assert_eq!(ui.file("app.hex", HEX).status, 200);
     let state = ui.until("the file", |state| !state["firmware"].is_null());
     let file = &state["firmware"];
@@ -325,6 +328,15 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     assert_eq!(ui.get("").status, 200);
 }
 
+/// What the page says of a file that it does not take; it begins with these words.
+#[track_caller]
+fn refuses(ui: &Ui, name: &str, bytes: &[u8], words: &str) -> Value {
+    let answer = ui.file(name, bytes);
+    assert_eq!(answer.status, 422, "{}", answer.body);
+    assert!(answer.json()["words"].as_str().unwrap().starts_with(words), "{}", answer.body);
+    answer.json()
+}
+
 /// The first lines of an upload that announces this many bytes.
 fn upload(ui: &Ui, announced: usize) -> String {
     let (path, host) = (&ui.path, ui.host_line());
@@ -333,18 +345,20 @@ fn upload(ui: &Ui, announced: usize) -> String {
     )
 }
 
+/// A connection that has sent this.
+fn sends(ui: &Ui, text: &str) -> TcpStream {
+    let mut stream = ui.stream();
+    stream.write_all(text.as_bytes()).unwrap();
+    stream
+}
+
 /// Forty uploads of 32 MiB that never end take the room of two: the others are refused before they
 /// are read, with words, and the page goes on.
 #[test]
 fn uploads_are_limited_together_and_before_they_are_read() {
     let ui = Ui::new(None);
     let head = upload(&ui, 32 << 20);
-    let mut open = Vec::new();
-    for _ in 0..40 {
-        let mut stream = ui.stream();
-        stream.write_all(head.as_bytes()).unwrap();
-        open.push(stream);
-    }
+    let mut open: Vec<TcpStream> = (0..40).map(|_| sends(&ui, &head)).collect();
     let mut refused = 0;
     for stream in &mut open {
         stream.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
@@ -375,8 +389,7 @@ fn an_upload_without_a_length_has_the_same_limit() {
     let chunk = |bytes: &[u8]| [format!("{:x}\r\n", bytes.len()).as_bytes(), bytes, b"\r\n"].concat();
     let small = [head.as_bytes(), &chunk(HEX), b"0\r\n\r\n"].concat();
     assert_eq!(ui.raw(&small).status, 200);
-    let mut stream = ui.stream();
-    stream.write_all(head.as_bytes()).unwrap();
+    let mut stream = sends(&ui, &head);
     let chunk = chunk(&[b'x'; 1 << 20]);
     for _ in 0..33 {
         stream.write_all(&chunk).unwrap();
@@ -403,13 +416,7 @@ fn connections_that_send_nothing_do_not_keep_the_page_away() {
     let ui = Ui::with(|options| options.head_timeout = Duration::from_secs(3600));
     let _page = ui.events("");
     for sent in ["", "G", "GET / HTTP/1.1\r\nHost: ", "GET / HTTP/1.1\r\nHost: x\r\n\r\n"] {
-        let idle: Vec<TcpStream> = (0..200)
-            .map(|_| {
-                let mut stream = ui.stream();
-                stream.write_all(sent.as_bytes()).unwrap();
-                stream
-            })
-            .collect();
+        let idle: Vec<TcpStream> = (0..200).map(|_| sends(&ui, sent)).collect();
         for what in ["", "app.js", "adapters"] {
             assert_eq!(ui.get(what).status, 200, "{sent:?} {what}");
         }
@@ -458,9 +465,7 @@ fn a_sealed_image_shows_what_it_says_or_is_refused_with_what_to_do() {
         (&[&file[..4], &[0; 4], &file[8..]].concat(), "app.cbs: the head is damaged"),
         (&[&file[..], b"x"].concat(), "app.cbs: it has"),
     ] {
-        let answer = ui.file("app.cbs", bytes);
-        assert_eq!(answer.status, 422, "{}", answer.body);
-        assert!(answer.json()["words"].as_str().unwrap().starts_with(words), "{}", answer.body);
+        refuses(&ui, "app.cbs", bytes, words);
     }
 }
 
@@ -519,8 +524,7 @@ fn a_bootloader_is_renewed_when_that_is_confirmed() {
     use kit::fake::renewal::{device, image, NEW};
     let (fake, log) = device(kit::fake::BOOTLOADER, |_| {});
     let (bus, _server) = kit::fake::serve(fake);
-    let ui = Ui::new(Some(bus));
-    ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+    let ui = Ui::on(bus);
     assert_eq!(ui.file("new.bin", &image(NEW)).status, 200);
     let order = |renew| json!({ "nodes": [kit::fake::NODE], "trial": true, "start": true, "renew": renew });
     let refused = ui.post("update", &order(false));
@@ -557,8 +561,7 @@ fn slow() -> Fake {
 #[test]
 fn a_second_update_is_refused_while_one_runs() {
     let (bus, _server) = kit::fake::serve(slow());
-    let ui = Ui::new(Some(bus));
-    ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+    let ui = Ui::on(bus);
     assert_eq!(ui.file("app.hex", HEX).status, 200);
     let update = json!({ "nodes": [kit::fake::NODE], "trial": false, "start": true });
     assert_eq!(ui.post("update", &update).status, 200);
@@ -612,8 +615,7 @@ fn what_is_known_of_a_device_outlives_its_update() {
 #[test]
 fn the_end_of_the_server_ends_an_update_in_order() {
     let (bus, server) = kit::fake::serve(slow());
-    let ui = Ui::new(Some(bus));
-    ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+    let ui = Ui::on(bus);
     ui.file("app.hex", HEX);
     ui.post("update", &json!({ "nodes": [kit::fake::NODE], "trial": false, "start": true }));
     ui.until("the update", |state| state["updates"][0]["phase"] == "running");
@@ -646,8 +648,7 @@ fn flood() -> String {
 /// A page that stops reading its events is dropped, and does not block the others meanwhile.
 #[test]
 fn a_reader_that_stops_reading_is_dropped() {
-    let ui = Ui::new(Some(flood()));
-    ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+    let ui = Ui::on(flood());
     let _lazy = ui.events("?frames=1");
     // From here on it reads nothing. Other pages are served until it is dropped.
     assert!((ui.readers)() > 0, "it was a reader at first");

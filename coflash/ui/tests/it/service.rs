@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use canopen::{Frame, NodeId};
@@ -67,6 +68,18 @@ fn station(folder: &Folder, package: Package, bus: Option<String>) -> Ui {
     let service = Service::new(package, "press.cpk".as_ref(), Origin::Package, &folder.join("reports"));
     let service = service.unwrap().memory(Some(folder.join("bus")));
     Ui::with(|options| (options.bus, options.service) = (bus, Some(service)))
+}
+
+/// A station for the two drives on a bus with these devices.
+fn drives(folder: &Folder, devices: Vec<Fake>) -> (Ui, JoinHandle<Bus>) {
+    let (bus, server) = kit::fake::serve(Bus(devices));
+    (station(folder, package(folder, DRIVES), Some(bus)), server)
+}
+
+/// What a station says that does nothing more.
+#[track_caller]
+fn refusal(ui: &Ui) -> Value {
+    ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false)
 }
 
 /// Searches, and returns the state with the plan.
@@ -280,8 +293,7 @@ fn a_search_alone_speaks_of_no_update() {
 fn a_device_that_is_exchanged_in_mid_plan_gets_nothing() {
     let folder = kit::folder!("service-exchanged");
     let (five, serial) = device(5, 1234);
-    let (bus, server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
-    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let (ui, server) = drives(&folder, vec![five, device(6, 1234).0]);
     let plan = planned(&ui);
     assert_eq!(plan["station"], "planned");
     *serial.lock().unwrap() = 4711;
@@ -305,7 +317,7 @@ fn a_second_station_is_waited_for() {
     ui.until("the adapter", |state| state["open"] == true);
     let refused = |ui: &Ui| {
         assert_eq!(ui.post("search", &json!({})).status, 200);
-        let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+        let state = refusal(ui);
         assert_eq!(state["message"]["key"], "trouble-not-alone", "{state}");
         assert_eq!((&state["message"]["number"], &state["plan"]), (&json!(0x6000_0012), &Value::Null));
     };
@@ -317,7 +329,7 @@ fn a_second_station_is_waited_for() {
     // It begins when this plan is on the screen: the plan stays, and can be confirmed when the other one is done.
     let held = Lock::of(&bus, NodeId::new(5).unwrap()).unwrap();
     assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
-    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    let state = refusal(&ui);
     assert_eq!((&state["message"]["key"], &state["plan"]), (&json!("trouble-not-alone"), &plan["plan"]));
     drop(held);
     assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
@@ -331,8 +343,7 @@ fn a_second_station_is_waited_for() {
         let request = Frame::new(id, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0]).unwrap();
         noisy.later(Duration::from_millis(40) * number, request);
     }
-    let (bus, server) = kit::fake::serve(Bus(vec![noisy]));
-    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let (ui, server) = drives(&folder, vec![noisy]);
     ui.until("the adapter", |state| state["open"] == true);
     refused(&ui);
     ui.finish();
@@ -343,14 +354,13 @@ fn a_second_station_is_waited_for() {
 #[test]
 fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
     let folder = kit::folder!("service-full");
-    let (bus, server) = kit::fake::serve(Bus(vec![device(5, 1234).0, device(6, 1234).0]));
-    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let (ui, server) = drives(&folder, vec![device(5, 1234).0, device(6, 1234).0]);
     let plan = planned(&ui);
     let (reports, away) = (folder.join("reports"), folder.join("away"));
     fs::rename(&reports, &away).unwrap();
     fs::write(&reports, "").unwrap();
     assert_eq!(confirm(&ui, &plan, &[5, 6]).status, 200);
-    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    let state = refusal(&ui);
     assert_eq!((&state["message"]["key"], &state["plan"]), (&json!("not-saved"), &plan["plan"]));
     assert_eq!(rows(&state), [(5, "state-due"), (6, "state-due")]);
     // The disk becomes full during the update.
@@ -373,7 +383,7 @@ fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
     // No other device is changed until it is saved, and a search does not lose it.
     let plan = planned(&ui);
     assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
-    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    let state = refusal(&ui);
     assert_eq!(state["unsaved"], 2);
     // The folder takes files again, but this report has no name there.
     fs::remove_file(&reports).unwrap();
@@ -384,15 +394,12 @@ fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
     let taken: Vec<PathBuf> = taken.map(|name| reports.join(name)).collect();
     taken.iter().for_each(|path| fs::write(path, "").unwrap());
     assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
-    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    let state = refusal(&ui);
     assert_eq!((&state["message"]["key"], &state["unsaved"]), (&json!("not-saved"), &json!(1)));
     assert_eq!(rows(&state), [(5, "state-due"), (6, "state-due")]);
     // The end of the server says what is lost with it.
-    let words = ui.finish().expect("a report is not saved");
-    assert!(
-        words.contains("could not be saved") && words.contains("000003EDh") && words.contains("4711"),
-        "{words}"
-    );
+    let said = ui.finish().expect("a report is not saved");
+    assert!(["could not be saved", "000003EDh", "4711"].iter().all(|words| said.contains(words)), "{said}");
     let fakes = server.join().unwrap().0;
     assert!(!fakes[0].blocks.is_empty() && fakes[1].blocks.is_empty());
 }
@@ -403,8 +410,7 @@ fn the_end_of_the_server_saves_the_outcome() {
     let folder = kit::folder!("service-end");
     let (mut five, _) = device(5, 1234);
     five.erase_time = Duration::from_secs(3600);
-    let (bus, _server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
-    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let (ui, _server) = drives(&folder, vec![five, device(6, 1234).0]);
     let plan = planned(&ui);
     assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
     ui.until("the update", |state| state["rows"][0]["state"] == "state-working");
