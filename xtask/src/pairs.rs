@@ -89,7 +89,7 @@ pub fn run(mut args: Args) -> Outcome {
     let (spread, page) = (args.flag("--spread"), args.flag("--page"));
     args.none_left()?;
     if page {
-        return write_page();
+        return files::write(&workspace::root().join(PAGE), self::page(&files::ours(PAGE)?)?);
     }
     setup::prepare(&[Part::Firmware])?;
     let fields = fields();
@@ -260,11 +260,6 @@ fn page(text: &str) -> Outcome<String> {
     let (before, after) = text.split_once(HEAD).ok_or(format!("{PAGE} has no table of the choices."))?;
     let (_, after) = after.split_once("\n\n").unwrap_or_default();
     Ok(format!("{before}{HEAD}{}\n{after}", rows()))
-}
-
-fn write_page() -> Outcome {
-    let path = workspace::root().join(PAGE);
-    files::write(&path, page(&files::ours(PAGE)?)?)
 }
 
 #[cfg(test)]
