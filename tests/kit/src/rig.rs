@@ -491,10 +491,23 @@ impl Rig {
         self.node = Self::boot(self.setup, &self.chip, self.buffer, request);
     }
 
-    /// CLEAR, which is taken, with all work.
+    /// A command that is taken, with all work.
+    #[track_caller]
+    pub fn work(&mut self, program: u8, command: u8) {
+        self.command(program, command).expect("the command is taken");
+        self.settle();
+    }
+
+    /// CLEAR.
     #[track_caller]
     pub fn clear(&mut self, program: u8) {
-        self.command(program, 3).expect("CLEAR is taken");
+        self.work(program, 3);
+    }
+
+    /// The right password, which is taken, with all work.
+    #[track_caller]
+    pub fn open(&mut self, program: u8) {
+        self.unlock(program).expect("the password is right");
         self.settle();
     }
 
@@ -543,8 +556,7 @@ impl Rig {
     /// comes to.
     pub fn status_of(&mut self, program: u8, data: &[u8]) -> u32 {
         if self.setup.password(program).is_some() {
-            self.unlock(program).expect("the password is right");
-            self.settle();
+            self.open(program);
         } else {
             self.command(program, 3).expect("CLEAR is taken");
         }
@@ -613,6 +625,26 @@ pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
     bytes.extend(data);
     bytes.extend(crc32(&bytes).to_le_bytes());
     bytes
+}
+
+/// A program in blocks, with one block of data.
+pub fn blocks(base: u32, program: &[u8]) -> [Vec<u8>; 3] {
+    let end = words(&[program.len() as u32, crc32(program)]);
+    [block(0, 0, &[0; 8]), block(1, base, program), block(u32::MAX, 0, &end)]
+}
+
+/// The record of a program that is released, and is neither sealed nor confirmed.
+pub fn released(size: u32, crc: u32) -> ProgramRecord {
+    ProgramRecord {
+        size,
+        crc,
+        signed: true,
+        confirmed: false,
+        version: 0,
+        half_erased: false,
+        seal: None,
+        withdrawn: false,
+    }
 }
 
 pub fn words(words: &[u32]) -> Vec<u8> {

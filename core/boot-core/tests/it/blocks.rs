@@ -4,7 +4,7 @@ use boot_core::flash::FlashFault;
 use canopen::od::Address;
 use canopen::AbortCode;
 use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE};
-use kit::rig::{block, crc32, raw, words, Rig, Setup, STANDARD_1, STANDARD_2};
+use kit::rig::{block, blocks, crc32, raw, words, Rig, Setup, STANDARD_1, STANDARD_2};
 
 use super::objects::{BUSY, MAN_BUSY};
 
@@ -86,8 +86,7 @@ fn only_the_last_block_may_be_longer_than_it_says() {
     last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
     for (number, reported, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
         let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &block(1, region.base, &image)).unwrap();
-        rig.settle();
+        rig.send_all(1, [&block(1, region.base, &image)]);
         let sent = rig.send(1, &old(number, region.base + 64, &last, reported));
         assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {reported}");
         rig.settle();
@@ -102,8 +101,7 @@ fn a_program_is_its_first_two_vectors_at_least() {
     for (size, status) in [(7, FORMAT), (8, 0)] {
         let image = raw(&STANDARD_1, 1, 8);
         let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &block(1, region.base, &image)).unwrap();
-        rig.settle();
+        rig.send_all(1, [&block(1, region.base, &image)]);
         let last = block(u32::MAX, 0, &words(&[size, crc32(&image[..size as usize])]));
         assert_eq!(rig.send(1, &last).is_ok(), status == 0, "{size}");
         rig.settle();
@@ -164,17 +162,13 @@ fn a_block_goes_on_beside_a_command_that_fails() {
     let mut rig = Rig::new(&STANDARD_2, 4096);
     let (one, two) = (raw(&STANDARD_2, 1, 600), raw(&STANDARD_2, 2, 600));
     rig.install(2, &two);
-    rig.command(2, CLR_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(2, CLR_SIGNATURE);
     rig.clear(1);
-    let base = STANDARD_2.region(1).base;
-    let last = words(&[600, crc32(&one)]);
-    for block in [block(0, 0, &[0; 8]), block(1, base, &one), block(u32::MAX, 0, &last)] {
+    for block in blocks(STANDARD_2.region(1).base, &one) {
         rig.begin(1, None, &block[..10]).unwrap();
         let next = rig.chip.model().operations + 1;
         rig.chip.model().fail = Some((next, FlashFault::Protected));
-        rig.command(2, SET_SIGNATURE).unwrap();
-        rig.settle();
+        rig.work(2, SET_SIGNATURE);
         assert_eq!(rig.status(2), 0x10, "NVDATA");
         let at = Address::new(0x1F50, 1);
         assert_eq!(rig.node.download_data(at, &block[10..]), Ok(()));
@@ -200,19 +194,12 @@ fn a_release_beside_an_open_download_leaves_it_open() {
     let (old, new) = (raw(&STANDARD_1, 1, 600), raw(&STANDARD_1, 1, 900));
     let mut rig = Rig::new(&STANDARD_1, 4096);
     rig.install(1, &old);
-    rig.command(1, CLR_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(1, CLR_SIGNATURE);
     rig.clear(1);
     rig.send(1, &block(0, 0, &[0; 8])).unwrap();
-    rig.command(1, SET_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(1, SET_SIGNATURE);
     assert_eq!(rig.stored().records[0].map(|record| record.2), Some(true), "it is released");
-    let base = STANDARD_1.region(1).base;
-    let last = words(&[900, crc32(&new)]);
-    for block in [block(1, base, &new), block(u32::MAX, 0, &last)] {
-        assert_eq!(rig.send(1, &block), Ok(()));
-        rig.settle();
-    }
+    rig.send_all(1, &blocks(STANDARD_1.region(1).base, &new)[1..]);
     assert_eq!((rig.status(1), rig.identification(1)), (0, crc32(&new)));
 }
 

@@ -3,7 +3,7 @@
 use canopen::AbortCode;
 use kit::bench::{CLEAR, CLR_SIGNATURE};
 use kit::model::{until_power_cut, Cut};
-use kit::rig::{raw, Rig, AT_ONCE_2, STANDARD_1, STANDARD_2};
+use kit::rig::{block, blocks, hex, raw, words, Rig, AT_ONCE_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::Region;
 
 /// No sector.
@@ -33,8 +33,7 @@ fn sectors(bytes: u32) -> Vec<u32> {
 fn clear(rig: &mut Rig, number: u8) -> Vec<u32> {
     rig.chip.model().touched.clear();
     for _ in 0..2 {
-        rig.command(number, CLEAR).expect("CLEAR is taken");
-        rig.settle();
+        rig.work(number, CLEAR);
         assert_eq!(rig.status(number), 0);
     }
     assert!(rig.cells(number).iter().all(|byte| *byte == 0xFF), "something is left");
@@ -58,16 +57,14 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     // confirmed.
     rig.install(1, &raw(&STANDARD_1, 1, 5000));
     rig.install(1, &raw(&STANDARD_1, 1, 600));
-    rig.command(1, 0x83).unwrap();
-    rig.settle();
+    rig.work(1, 0x83);
     rig.reset();
     assert_eq!(clear(&mut rig, 1), sectors(5000));
     // Another command between them is no download.
     rig.install(1, &raw(&STANDARD_1, 1, 100));
     erased(&rig, 1);
     for command in [CLEAR, CLR_SIGNATURE, CLEAR] {
-        rig.command(1, command).unwrap();
-        rig.settle();
+        rig.work(1, command);
     }
     assert_eq!(erased(&rig, 1), sectors(100));
     // Sectors that were erased for the program, but not written, are still erased.
@@ -125,12 +122,9 @@ fn data_right_after_clear_are_taken() {
     for setup in [&STANDARD_1, &STANDARD_2, &AT_ONCE_2] {
         let (number, base) = (setup.programs(), setup.region(setup.programs()).base);
         let image = raw(setup, number, 1200);
-        let blocks = [
-            kit::rig::block(0, 0, &kit::rig::words(&[1200, 0, 0])),
-            kit::rig::block(1, base, &image),
-            kit::rig::block(u32::MAX, 0, &kit::rig::words(&[1200, kit::rig::crc32(&image)])),
-        ];
-        for file in [vec![image.clone()], vec![kit::rig::hex(base, &image)], blocks.to_vec()] {
+        let mut blocks = blocks(base, &image);
+        blocks[0] = block(0, 0, &words(&[1200, 0, 0]));
+        for file in [vec![image.clone()], vec![hex(base, &image)], blocks.to_vec()] {
             // What was installed, the number of CLEARs, and the steps after the last one.
             for (was, clears, steps) in
                 [(0, 3, 0), (0, 3, 4), (0, 5, 0), (3000, 2, 0), (3000, 2, 60), (3000, 2, 4000), (1500, 1, 3)]

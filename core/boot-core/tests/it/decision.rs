@@ -5,12 +5,18 @@ use boot_core::crc::CrcKind;
 use boot_core::decision::{choose, Exit, Images, Policy, Woken};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
-use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
+use boot_core::store::{Journal, Key, Parameters, Value};
 use kit::model::ModelFlash;
+use kit::rig::released;
 use shared_abi::boot_report::Reason;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
+
+fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) {
+    journal.store(key, value);
+    run(flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+}
 
 /// A released program of 64 bytes as a download leaves it, and its check.
 fn check(damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invalid> {
@@ -20,18 +26,7 @@ fn check(damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invali
     bytes[4..8].copy_from_slice(&0x0802_0189_u32.to_le_bytes());
     flash.poke(0x0802_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
-    let record = ProgramRecord {
-        seal: None,
-        withdrawn: false,
-        size: 64,
-        crc: boot_core::crc32(&bytes),
-        signed: true,
-        confirmed: false,
-        version: 0,
-        half_erased: false,
-    };
-    journal.store(Key::program(1), record.value());
-    run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+    store(&mut flash, &mut journal, Key::program(1), released(64, boot_core::crc32(&bytes)).value());
     damage(&mut flash);
     verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1)
 }
@@ -47,19 +42,8 @@ fn a_program_ends_inside_its_region() {
         flash.poke(region.base, &vectors);
         let mut bytes = vec![0; size as usize];
         flash.read(region.base, &mut bytes);
-        let record = ProgramRecord {
-            seal: None,
-            withdrawn: false,
-            size,
-            crc: boot_core::crc32(&bytes),
-            signed: true,
-            confirmed: true,
-            version: 0,
-            half_erased: false,
-        };
         let mut journal = Journal::open(&flash, LAYOUT.parameters);
-        journal.store(Key::program(1), record.value());
-        run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+        store(&mut flash, &mut journal, Key::program(1), released(size, boot_core::crc32(&bytes)).value());
         verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1).map(|_| ())
     };
     assert_eq!(verified(region.size), Ok(()));
@@ -98,21 +82,7 @@ fn a_journal_of_the_map_before_this_one_starts_nothing_and_can_be_written() {
         let program = [0xA5; 64];
         flash.poke(0x0801_0000, &program);
         let mut journal = Journal::open(&flash, before);
-        let record = ProgramRecord {
-            seal: None,
-            withdrawn: false,
-            size: 64,
-            crc: boot_core::crc32(&program),
-            signed: true,
-            confirmed: true,
-            version: 0,
-            half_erased: false,
-        };
-        let store = |flash: &mut ModelFlash, journal: &mut Journal, key, value| {
-            journal.store(key, value);
-            run(flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
-        };
-        store(&mut flash, &mut journal, Key::program(1), record.value());
+        store(&mut flash, &mut journal, Key::program(1), released(64, boot_core::crc32(&program)).value());
         for count in 0..stores {
             store(&mut flash, &mut journal, Key::CRASH_COUNT, [count % 3, 0, 0, 0]);
         }

@@ -5,6 +5,8 @@ use canopen::{BitRate, NodeId};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{block, crc32, program, words, Rig, Setup, ESACADEMY_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
 
+use super::parameters::{header_of, slot};
+
 const CLEAR: u8 = 3;
 const BUFFER: usize = 1024;
 
@@ -54,19 +56,16 @@ fn a_download_that_begins_ends_one_of_another_program() {
         let mut device = Rig::new(setup, BUFFER);
         device.command(one, CLEAR).unwrap();
         device.send(one, &control).unwrap();
-        device.send(one, &data(one, 0)).unwrap();
-        device.settle();
+        device.send_all(one, [&data(one, 0)]);
 
         // A block of the other program, without its CLEAR: refused.
         device.send(other, &data(other, 0)).unwrap_err();
         device.settle();
-        device.send(one, &data(one, 1)).unwrap();
-        device.settle();
+        device.send_all(one, [&data(one, 1)]);
         assert_eq!(device.status(one), 0, "{one}");
 
         device.command(other, CLEAR).unwrap();
-        device.send(other, &control).unwrap();
-        device.settle();
+        device.send_all(other, [&control]);
         let before = device.cells(one);
         device.send(one, &data(one, 2)).unwrap_err();
         device.settle();
@@ -75,23 +74,13 @@ fn a_download_that_begins_ends_one_of_another_program() {
 
         // This refusal ended nothing, and the ended download can begin again.
         for n in 0..7 {
-            device.send(other, &data(other, n)).unwrap();
-            device.settle();
+            device.send_all(other, [&data(other, n)]);
         }
-        device.send(other, &last(other)).unwrap();
-        device.settle();
+        device.send_all(other, [&last(other)]);
         assert_eq!((device.status(other), device.state(other)), (0, 0), "{one}");
         device.install(one, &new[usize::from(one) - 1]);
         assert!(device.is_true(one) && device.is_true(other), "{one}");
     }
-}
-
-/// A slot of the journal (docs/adr/0004): five words, their CRC, and the mark.
-fn slot(five: [u32; 5]) -> Vec<u8> {
-    let mut bytes = words(&five);
-    bytes.extend(crc32(&bytes).to_le_bytes());
-    bytes.extend([0; 4]);
-    bytes
 }
 
 /// An older bootloader does not erase the journal of a newer one, which it cannot read: every store
@@ -100,14 +89,12 @@ fn slot(five: [u32; 5]) -> Vec<u8> {
 #[test]
 fn a_journal_of_a_newer_format_refuses_what_has_to_be_stored_and_is_left_alone() {
     const NEWER: u32 = 0xFF;
-    let magic = u32::from_le_bytes(*b"CBNV");
-    let header = |sequence: u32, format| slot([magic, sequence, !sequence, format, u32::MAX]);
     let regions = STANDARD_1.layout.parameters;
     // By the region of the newer journal, and the contents of the other region.
-    let cases = [(0, None), (1, None), (0, Some(header(6, 0))), (1, Some(header(6, 1)))];
+    let cases = [(0, None), (1, None), (0, Some(header_of(6, 0))), (1, Some(header_of(6, 1)))];
     for (newer, other) in cases {
         let mut flash = ModelFlash::new(&CHIP);
-        flash.poke(regions[newer].base, &header(7, NEWER));
+        flash.poke(regions[newer].base, &header_of(7, NEWER));
         flash.poke(regions[newer].base + 28, &slot([0x0001_0001, 1, 2, 3, 4]));
         if let Some(other) = &other {
             flash.poke(regions[1 - newer].base, other);

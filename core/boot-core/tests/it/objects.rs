@@ -15,11 +15,12 @@ use canopen::od::{Address, Objects};
 use canopen::program::ProgramStart;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
-use kit::bench::{new_flash, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, SET_SIGNATURE, START};
+use kit::bench::{new_flash, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, DATA, SET_SIGNATURE, START};
 use kit::boot::{leaked, Boot};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
-    crc32, raw, Rig, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
+    block, blocks, crc32, hex, raw, words, Rig, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1,
+    STANDARD_2, VENDOR_ID,
 };
 use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::handoff::ResetCause;
@@ -84,8 +85,7 @@ fn a_stream_leaves_a_reserve_of_the_queue() {
     for (queue, reserve) in [(65536, 8192), (16384, 4096), (4096, 1024)] {
         let mut rig = Rig::new(&STANDARD_1, queue);
         rig.begin(1, Some(3000), &raw(&STANDARD_1, 1, 3000)[..700]).unwrap();
-        let data = Address::new(0x1F50, 1);
-        let [room, with_reserve] = [false, true].map(|held| rig.node.download_space(data, held));
+        let [room, with_reserve] = [false, true].map(|held| rig.node.download_space(DATA, held));
         assert_eq!(with_reserve - room, reserve, "of {queue}");
     }
 }
@@ -156,17 +156,10 @@ fn a_control_block_names_the_version() {
     for (told, version) in [(0, 1), (77, 77)] {
         rig.clear(1);
         // Manual L-1112d_10, figure 13: size, vendor-ID, product code, version, date.
-        let control = kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
-        let mut last = 600_u32.to_le_bytes().to_vec();
-        last.extend(crc32(&image).to_le_bytes());
-        rig.send_all(
-            1,
-            [
-                kit::rig::block(0, 0, &control),
-                kit::rig::block(1, STANDARD_1.region(1).base, &image),
-                kit::rig::block(u32::MAX, 0, &last),
-            ],
-        );
+        let control = words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
+        let mut file = blocks(STANDARD_1.region(1).base, &image);
+        file[0] = block(0, 0, &control);
+        rig.send_all(1, file);
         assert_eq!((rig.state(1), rig.status(1)), (0, 0));
         assert_eq!(rig.word(0x2005, 1), version);
     }
@@ -180,12 +173,11 @@ fn a_hole_in_a_program_is_erased_with_it() {
     rig.install(1, &raw(&STANDARD_1, 1, 0x2C00));
     let (first, last) = (raw(&STANDARD_1, 1, 256), [0x5A; 16]);
     // The record of the end is cut off from the first data, and the end from the second.
-    let head = String::from_utf8(kit::rig::hex(region.base, &first)).unwrap();
-    let tail = String::from_utf8(kit::rig::hex(region.base + 0x2800, &last)).unwrap();
+    let head = String::from_utf8(hex(region.base, &first)).unwrap();
+    let tail = String::from_utf8(hex(region.base + 0x2800, &last)).unwrap();
     let text = head.lines().take(17).chain(tail.lines()).collect::<Vec<_>>().join("\n") + "\n";
     rig.clear(1);
-    rig.send(1, text.as_bytes()).unwrap();
-    rig.settle();
+    rig.send_all(1, [text.as_bytes()]);
     assert_eq!((rig.state(1), rig.status(1)), (0, 0));
     let mut whole = vec![0xFF; 0x2810];
     whole[..256].copy_from_slice(&first);
@@ -227,8 +219,7 @@ fn whoever_leaves_takes_no_further_order() {
     let mut rig = Rig::new(&STANDARD_2, 1024);
     rig.install(1, &raw(&STANDARD_2, 1, 600));
     rig.install(2, &raw(&STANDARD_2, 2, 600));
-    rig.command(1, SET_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(1, SET_SIGNATURE);
     rig.command(1, START).unwrap();
     for number in [1, 2] {
         for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
@@ -253,7 +244,7 @@ fn an_acknowledged_order_is_finishing_until_it_is_stored() {
     rig.begin(1, None, &image).unwrap();
     rig.settle();
     assert!(!rig.node.is_finishing(), "half a program is none");
-    rig.node.download_end(Address::new(0x1F50, 1)).unwrap();
+    rig.node.download_end(DATA).unwrap();
     let (mut steps, mut readable) = (0, 0);
     while rig.node.is_finishing() {
         readable += u32::from(rig.stored().records[0].is_some());
@@ -287,8 +278,7 @@ fn what_changes_nothing_writes_nothing() {
         rig.install(1, &raw(setup, 1, 600));
         for (command, released) in [(SET_SIGNATURE, true), (CLR_SIGNATURE, false)] {
             rig.unlock(1).unwrap();
-            rig.command(1, command).unwrap();
-            rig.settle();
+            rig.work(1, command);
             rig.reset();
             rig.chip.model().touched.clear();
             for round in 0..30 {
@@ -314,16 +304,14 @@ fn what_changes_nothing_writes_nothing() {
 fn a_password_that_finds_no_program_writes_nothing() {
     let mut rig = Rig::new(&ESACADEMY_1, 4096);
     rig.install(1, &raw(&ESACADEMY_1, 1, 600));
-    rig.unlock(1).unwrap();
-    rig.settle();
+    rig.open(1);
     assert_eq!(rig.stored().records[0], None);
     rig.chip.model().touched.clear();
     for round in 0..30 {
         if round % 3 == 0 {
             rig.reset();
         }
-        rig.unlock(1).unwrap();
-        rig.settle();
+        rig.open(1);
         assert_eq!(rig.chip.model().touched, [], "round {round}");
     }
 }
@@ -428,7 +416,7 @@ fn who_writes_an_object_of_an_update_holds_the_device() {
         assert_eq!(node.is_asked(), holds, "{index:04X}h");
     }
     let mut node = with_choices::<Everything>(new_flash());
-    let _ = node.download_start(Address::new(0x1F50, 1), None);
+    let _ = node.download_start(DATA, None);
     assert!(node.is_asked());
 }
 
@@ -475,7 +463,7 @@ fn the_end_of_work_is_told_by_an_emergency() {
     // A block with a wrong CRC.
     let mut rig = Rig::new(&STANDARD_1, 1024);
     rig.clear(1);
-    let mut bad = kit::rig::block(0, 0, &[0; 8]);
+    let mut bad = block(0, 0, &[0; 8]);
     *bad.last_mut().unwrap() ^= 1;
     assert!(rig.send(1, &bad).is_err());
     rig.settle();
@@ -546,8 +534,7 @@ fn the_reason_to_stay_is_that_of_the_next_reset() {
     is(&mut rig, "program 2 starts in its place", 255, 2);
     for (program, reason) in [(2, 5), (1, 6)] {
         for _ in 0..2 {
-            rig.command(program, CLEAR).unwrap();
-            rig.settle();
+            rig.work(program, CLEAR);
         }
         is(&mut rig, "erased", reason, 0);
     }
@@ -567,8 +554,7 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
     ] {
         let mut rig = Rig::new(&STANDARD_1, 4096);
         rig.install(1, &raw(&STANDARD_1, 1, 700));
-        rig.command(1, SET_SIGNATURE).unwrap();
-        rig.settle();
+        rig.work(1, SET_SIGNATURE);
         let mut flash = rig.chip.model().clone();
         // A program that the boot stage has found damaged is none, whatever kept the device before.
         let refused = u8::from([9, 10].contains(&now));
@@ -658,16 +644,15 @@ fn what_a_product_does_without_is_not_there() {
     for (index, sub) in [(0x1201, 1), (0x2006, 1), (0x1F52, 1), (0x1F52, 2)] {
         assert!(least.read(Address::new(index, sub), &mut [0; 8]).is_err(), "{index:04X}h/{sub}");
     }
-    let program = Address::new(0x1F50, 1);
-    assert_eq!(least.download_start(program, None), Ok(()));
-    assert!(least.download_data(program, b":10000000").is_err(), "Intel HEX");
+    assert_eq!(least.download_start(DATA, None), Ok(()));
+    assert!(least.download_data(DATA, b":10000000").is_err(), "Intel HEX");
     // Nor does it take a password, or give a program back.
     for index in [0x7F50, 0x6005, 0x2002] {
         assert!(least.write(Address::new(index, 1), &[0; 4]).is_err(), "{index:04X}h");
     }
     assert_eq!(least.write(Address::new(0x2008, 0), b"roml"), Err(AbortCode(0x0601_0000)));
-    assert!(least.upload_start(Address::new(0x1F50, 1)).is_err());
-    assert!(least.upload_data(Address::new(0x1F50, 1), 0, &mut [0; 7]).is_err());
+    assert!(least.upload_start(DATA).is_err());
+    assert!(least.upload_data(DATA, 0, &mut [0; 7]).is_err());
 
     let unknown_request = AbortCode(0x0800_0000);
     let node = NodeId::new(5).unwrap();
@@ -708,16 +693,14 @@ fn what_a_product_does_without_is_not_there() {
 #[test]
 fn a_stored_program_can_be_read_by_who_has_the_password() {
     let mut rig = Rig::new(&LIFT_1, 1024);
-    let at = Address::new(0x1F50, 1);
-    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY), "locked");
-    rig.unlock(1).unwrap();
-    rig.settle();
-    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0800_0024)), "no data");
+    assert_eq!(rig.node.upload_start(DATA), Err(MAN_BUSY), "locked");
+    rig.open(1);
+    assert_eq!(rig.node.upload_start(DATA), Err(AbortCode(0x0800_0024)), "no data");
     let mut image = raw(&LIFT_1, 1, 1500);
     image[600..630].copy_from_slice(b"$CANopenSoftwareVersion\x004.7.1\0");
     rig.install(1, &image);
     assert_eq!(read(&mut rig, 0x100A, 0), Ok(b"4.7.1".to_vec()), "CiA 814-1 clause 6.5");
-    assert_eq!(rig.node.upload_start(at), Ok(Some(1500)));
+    assert_eq!(rig.node.upload_start(DATA), Ok(Some(1500)));
     for (offset, len, expected) in [
         (0, 7, &image[..7]),
         (7, 889, &image[7..896]),
@@ -726,17 +709,17 @@ fn a_stored_program_can_be_read_by_who_has_the_password() {
         (9000, 7, &[]),
     ] {
         let mut bytes = vec![0; len];
-        assert_eq!(rig.node.upload_data(at, offset, &mut bytes), Ok(expected.len()), "{offset}");
+        assert_eq!(rig.node.upload_data(DATA, offset, &mut bytes), Ok(expected.len()), "{offset}");
         assert_eq!(bytes[..expected.len()], *expected, "{offset}");
     }
     // Not while the flash works.
     rig.begin(1, None, &image).unwrap();
     rig.steps(1);
-    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY));
+    assert_eq!(rig.node.upload_start(DATA), Err(MAN_BUSY));
     // The standard profile has no such thing.
     let mut rig = Rig::new(&STANDARD_1, 1024);
     rig.install(1, &raw(&STANDARD_1, 1, 300));
-    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0601_0001)), "write only");
+    assert_eq!(rig.node.upload_start(DATA), Err(AbortCode(0x0601_0001)), "write only");
 }
 
 /// Program 2 of a lift is a set of parameters: any bytes, and 1F51h does not start it.
@@ -746,8 +729,7 @@ fn data_of_the_application_are_any_bytes() {
     for data in [&b"x"[..], b"0123456789", &[0xFF; 100]] {
         rig.install(2, data);
         assert_eq!((rig.state(2), rig.identification(2)), (0, crc32(data)));
-        rig.command(2, START).unwrap();
-        rig.settle();
+        rig.work(2, START);
         assert_eq!((rig.status(2), rig.node.take_boot_request()), (0x02, None), "NOVALPROG");
         // Nor does a START that comes before they are verified.
         rig.unlock(2).unwrap();
@@ -886,10 +868,10 @@ fn the_next_block_is_taken_while_the_flash_works_if_there_is_room() {
     for (buffer, room) in [(1024, false), (64 * 1024, true)] {
         let mut rig = Rig::new(&STANDARD_2, buffer);
         rig.clear(1);
-        rig.send(1, &kit::rig::block(0, 0, &kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
-        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
+        rig.send(1, &block(0, 0, &words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
+        rig.send(1, &block(1, region.base, &image)).unwrap();
         assert_eq!(rig.status(1) & BUSY, u32::from(!room));
-        let next = rig.node.download_start(Address::new(0x1F50, 1), None);
+        let next = rig.node.download_start(DATA, None);
         assert_eq!(next, if room { Ok(()) } else { Err(MAN_BUSY) }, "{buffer}");
         rig.cancel(1);
         assert_eq!(rig.node.download_start(Address::new(0x1F50, 2), None), Err(MAN_BUSY), "{buffer}");
@@ -906,14 +888,9 @@ fn what_no_block_has_belongs_to_the_program_and_is_erased() {
     let mut whole = vec![0xFF; 0x2400];
     whole[..600].copy_from_slice(&data);
     rig.clear(1);
-    rig.send_all(
-        1,
-        [
-            kit::rig::block(0, 0, &[0; 8]),
-            kit::rig::block(1, region.base, &data),
-            kit::rig::block(u32::MAX, 0, &kit::rig::words(&[0x2400, crc32(&whole)])),
-        ],
-    );
+    let mut file = blocks(region.base, &data);
+    file[2] = block(u32::MAX, 0, &words(&[0x2400, crc32(&whole)]));
+    rig.send_all(1, file);
     assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&whole)));
     assert_eq!(rig.cells(1)[..whole.len()], whole);
 }
@@ -923,8 +900,7 @@ fn what_no_block_has_belongs_to_the_program_and_is_erased() {
 fn a_password_waits_for_what_is_acknowledged() {
     let image = raw(&ESACADEMY_1, 1, 900);
     let mut rig = Rig::new(&ESACADEMY_1, 4096);
-    rig.unlock(1).unwrap();
-    rig.settle();
+    rig.open(1);
     rig.send(1, &image).unwrap();
     while rig.stored().records[0].is_none() {
         assert_eq!(rig.unlock(1), Err(MAN_BUSY));
@@ -946,7 +922,7 @@ fn a_password_leaves_nothing_of_the_session_before() {
     rig.command(1, START).unwrap();
     let request = rig.node.take_boot_request();
     assert!(matches!(request, Some(BootRequest::Start(1) | BootRequest::Trial(1))), "{request:?}");
-    assert!(rig.send(1, &kit::rig::block(7, LIFT_1.region(1).base, &[0; 8])).is_err());
+    assert!(rig.send(1, &block(7, LIFT_1.region(1).base, &[0; 8])).is_err());
     assert_ne!(rig.status(1), 0);
     rig.unlock(1).unwrap();
     assert_eq!(rig.status(1), 0);
@@ -959,8 +935,7 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
         let mut rig = Rig::new(setup, 4096);
         rig.install(1, &raw(setup, 1, 600));
         rig.reset();
-        rig.unlock(1).unwrap();
-        rig.settle();
+        rig.open(1);
         rig.send(1, &raw(setup, 1, 700)).map_or_else(|_| assert!(!replaces), |()| assert!(replaces));
         rig.settle();
         let size = if replaces { 700 } else { 600 };
@@ -970,8 +945,7 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
             rig.begin(1, None, &raw(setup, 1, 800)[..700]).unwrap();
             rig.settle();
             rig.cancel(1);
-            rig.send(1, &raw(setup, 1, 800)).unwrap();
-            rig.settle();
+            rig.send_all(1, [&raw(setup, 1, 800)]);
             assert_eq!(rig.stored().records[0].map(|record| record.0), Some(800));
         }
     }
@@ -988,7 +962,6 @@ fn stop_of_a_program_leaves_the_other_one_alone() {
     rig.command(2, 0x00).unwrap();
     assert_eq!(rig.send(1, &raw(&STANDARD_2, 1, 700)), Err(MAN_BUSY));
     assert_eq!(rig.status(1), 0x08, "NOTCLEARED");
-    rig.send(2, &raw(&STANDARD_2, 2, 700)).unwrap();
-    rig.settle();
+    rig.send_all(2, [&raw(&STANDARD_2, 2, 700)]);
     assert_eq!(rig.stored().records.map(|record| record.map(|record| record.0)), [Some(600), Some(700)]);
 }

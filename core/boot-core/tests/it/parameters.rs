@@ -9,6 +9,7 @@ use canopen::{BitRate, Instant, NodeId};
 use kit::bench::{block, node, program, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, DATA, START};
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::rig::released;
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::Layout;
@@ -28,7 +29,7 @@ fn empty() -> (ModelFlash, Journal) {
     (flash, journal)
 }
 
-fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) -> Result<(), StoreError> {
+fn store(flash: &mut impl Flash, journal: &mut Journal, key: Key, value: Value) -> Result<(), StoreError> {
     journal.store(key, value);
     run(flash, |flash, outcome| journal.next(flash, outcome))
 }
@@ -148,20 +149,11 @@ fn errors_of_the_flash_are_told_and_the_old_value_stays() {
     }
 }
 
-/// A slot as in docs/adr/0004: five words, their CRC, and the mark.
-fn slot(words: [u32; 5]) -> Vec<u8> {
-    let mut bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-    bytes.extend(boot_core::crc32(&bytes).to_le_bytes());
-    bytes.extend([0; 4]);
-    bytes
-}
-
 #[test]
 fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_is_not_read() {
     for (version, known) in [(0, true), (1, true), (2, false)] {
         let mut flash = ModelFlash::new(&SMALL);
-        let magic = u32::from_le_bytes(*b"CBNV");
-        flash.poke(REGIONS[0].base, &slot([magic, 7, !7, version, u32::MAX]));
+        flash.poke(REGIONS[0].base, &header_of(7, version));
         flash.poke(REGIONS[0].base + SLOT, &slot([0x0001_0002, 1, 2, 3, 4]));
         let mut journal = Journal::open(&flash, REGIONS);
         assert_eq!(journal.get(&flash, Key::program(2)), known.then_some([1, 2, 3, 4]), "version {version}");
@@ -171,7 +163,7 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
             assert_eq!(reopened.get(&flash, Key::program(2)), Some([1, 2, 3, 4]));
             assert_eq!(reopened.get(&flash, Key::CRASH_COUNT), Some([9, 0, 0, 0]));
             // The other region, the next sequence number, today's version.
-            assert_eq!(flash.cells(REGIONS[1])[..SLOT as usize], slot([magic, 8, !8, 1, u32::MAX]));
+            assert_eq!(flash.cells(REGIONS[1])[..SLOT as usize], header(8));
         }
     }
 }
@@ -180,14 +172,10 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
 /// changes. This holds for each region of the newer journal, and any contents of the other region.
 #[test]
 fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
-    let header = |sequence: u32, version| {
-        let magic = u32::from_le_bytes(*b"CBNV");
-        slot([magic, sequence, !sequence, version, u32::MAX])
-    };
-    let others = [None, Some(header(6, 0)), Some(header(6, 1)), Some(vec![0xA5; 24])];
+    let others = [None, Some(header_of(6, 0)), Some(header_of(6, 1)), Some(vec![0xA5; 24])];
     for (newer, other) in [0, 1].into_iter().flat_map(|newer| others.clone().map(|other| (newer, other))) {
         let mut flash = ModelFlash::new(&SMALL);
-        flash.poke(REGIONS[newer].base, &header(7, 0xFF));
+        flash.poke(REGIONS[newer].base, &header_of(7, 0xFF));
         flash.poke(REGIONS[newer].base + SLOT, &slot([0x0001_0002, 1, 2, 3, 4]));
         if let Some(other) = &other {
             flash.poke(REGIONS[1 - newer].base, other);
@@ -219,8 +207,20 @@ fn a_store_that_is_asked_while_the_flash_works_is_caught() {
 const MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
 const SLOT: u32 = 28;
 
+/// A slot as in docs/adr/0004: five words, their CRC, and the mark.
+pub(super) fn slot(words: [u32; 5]) -> Vec<u8> {
+    let mut bytes = words.map(u32::to_le_bytes).concat();
+    bytes.extend(boot_core::crc32(&bytes).to_le_bytes());
+    bytes.extend([0; 4]);
+    bytes
+}
+
+pub(super) fn header_of(sequence: u32, version: u32) -> Vec<u8> {
+    slot([MAGIC, sequence, !sequence, version, u32::MAX])
+}
+
 fn header(sequence: u32) -> Vec<u8> {
-    slot([MAGIC, sequence, !sequence, 1, u32::MAX])
+    header_of(sequence, 1)
 }
 
 fn record(key: Key, [a, b, c, d]: Value) -> Vec<u8> {
@@ -720,11 +720,6 @@ impl Flash for Worn {
     }
 }
 
-fn store_worn(flash: &mut Worn, journal: &mut Journal, value: Value) -> Result<(), StoreError> {
-    journal.store(Key::NODE, value);
-    run(flash, |flash, outcome| journal.next(flash, outcome))
-}
-
 /// A place that does not hold a record is passed over. (Where the header and the copies of a
 /// compaction belong, there is no other place: then the store fails, and the value before it stays.)
 #[test]
@@ -735,7 +730,7 @@ fn a_worn_out_slot_costs_a_slot_and_no_value() {
         let mut worn = Worn { flash, places: vec![Region::new(REGIONS[1].base + slot * SLOT, SLOT)] };
         let mut stored = None;
         for n in 1..40 {
-            let outcome = store_worn(&mut worn, &mut journal, [n; 4]);
+            let outcome = store(&mut worn, &mut journal, Key::NODE, [n; 4]);
             if slot > 1 {
                 assert_eq!(outcome, Ok(()), "slot {slot}, value {n}");
             }
@@ -765,7 +760,7 @@ fn a_store_tries_nine_places() {
         let flash = ModelFlash::new(&LARGER);
         let mut journal = Journal::open(&flash, regions);
         let mut worn = Worn { flash, places: vec![Region::new(regions[0].base + SLOT, bad * SLOT)] };
-        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), outcome, "{bad} bad places");
+        assert_eq!(store(&mut worn, &mut journal, Key::NODE, [7; 4]), outcome, "{bad} bad places");
     }
 }
 
@@ -779,7 +774,7 @@ fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
     let rest = Region::new(REGIONS[0].base + 2 * SLOT, 256 - 2 * SLOT);
     let mut worn = Worn { flash, places: vec![rest, REGIONS[1]] };
     for attempt in 1..4 {
-        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut), "{attempt}");
+        assert_eq!(store(&mut worn, &mut journal, Key::NODE, [7; 4]), Err(StoreError::WornOut), "{attempt}");
         for journal in [&journal, &Journal::open(&worn, REGIONS)] {
             assert_eq!(journal.get(&worn, Key::NODE), Some([1; 4]), "{attempt}");
         }
@@ -796,7 +791,7 @@ fn a_device_whose_regions_are_worn_out_stores_nothing_and_says_so() {
         let flash = ModelFlash::new(&SMALL);
         let mut journal = Journal::open(&flash, REGIONS);
         let mut worn = Worn { flash, places };
-        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut));
+        assert_eq!(store(&mut worn, &mut journal, Key::NODE, [7; 4]), Err(StoreError::WornOut));
         assert_eq!(Journal::open(&worn, REGIONS).get(&worn, Key::NODE), None);
     }
 }
@@ -842,16 +837,8 @@ fn the_record_of_a_program_has_its_words() {
         (true, true, flags(b"RUN1")),
     ] {
         for (half_erased, first) in [(false, 0x0000_1234), (true, 0x8000_1234)] {
-            let record = ProgramRecord {
-                size: 0x1234,
-                crc: 0xCAFE_F00D,
-                signed,
-                confirmed,
-                version: 77,
-                half_erased,
-                seal: None,
-                withdrawn: false,
-            };
+            let record = released(0x1234, 0xCAFE_F00D);
+            let record = ProgramRecord { signed, confirmed, version: 77, half_erased, ..record };
             assert_eq!(record.value(), [first, 0xCAFE_F00D, word, 77]);
             assert_eq!(ProgramRecord::from_value(record.value()), Some(record));
         }
@@ -872,16 +859,9 @@ fn the_record_of_a_program_has_its_words() {
 fn a_withdrawn_program_is_not_released_by_its_flags() {
     use boot_core::store::record::Seal;
 
-    let record = ProgramRecord {
-        size: 0x1234,
-        crc: 1,
-        signed: false,
-        confirmed: true,
-        version: 7,
-        half_erased: false,
-        seal: Some(Seal::Locked),
-        withdrawn: true,
-    };
+    let seal = Some(Seal::Locked);
+    let record = ProgramRecord { confirmed: true, version: 7, seal, ..released(0x1234, 1) };
+    let record = ProgramRecord { signed: false, withdrawn: true, ..record };
     let confirmed = u32::from_le_bytes(*b"RUN0");
     assert_eq!(record.value(), [0x5000_1234, 1, confirmed, 7]);
     assert_eq!(ProgramRecord::from_value(record.value()), Some(record));

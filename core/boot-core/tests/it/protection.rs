@@ -104,8 +104,7 @@ fn blocks_are_refused_before_the_record_is_removed() {
         rig.chip.model().protected = vec![sector];
         rig.clear(1);
         assert_eq!(rig.status(1), 0, "CLEAR alone loses nothing");
-        rig.send(1, &control).unwrap();
-        rig.settle();
+        rig.send_all(1, [&control]);
         let sent = rig.send(1, &block(1, base, &new[..1000]));
         rig.settle();
         if takes {

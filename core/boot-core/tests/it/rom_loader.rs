@@ -44,8 +44,7 @@ fn a_password_or_the_product_keeps_a_client_from_the_loader() {
     for setup in [&ESACADEMY_1, &LIFT_1] {
         let mut rig = rig(setup);
         assert_eq!(rig.node.write(ROM_LOADER, b"roml"), STATE, "{}", setup.name);
-        rig.unlock(1).unwrap();
-        rig.settle();
+        rig.open(1);
         assert_eq!(rig.node.write(ROM_LOADER, b"roml"), Ok(()), "{}", setup.name);
     }
     let mut flash = ModelFlash::new(&CHIP);

@@ -56,8 +56,7 @@ fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
     rig.clear(1);
     assert_eq!(rig.status(1), 0, "CLEAR alone loses nothing");
     let control = [3000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat();
-    rig.send(1, &block(0, 0, &control)).unwrap();
-    rig.settle();
+    rig.send_all(1, [&block(0, 0, &control)]);
     let base = STANDARD_1.region(1).base;
     let _ = rig.send(1, &block(1, base, &new[..1000]));
     rig.settle();
@@ -85,12 +84,10 @@ fn neither_signature_nor_node_id_is_stored() {
     let image = raw(&STANDARD_1, 900, 1);
     let mut rig = Rig::new(&STANDARD_1, 8192);
     rig.install(1, &image);
-    rig.command(1, 0x84).unwrap();
-    rig.settle();
+    rig.work(1, 0x84);
     let stored = rig.stored();
     set_low(&rig, true);
-    rig.command(1, SET_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(1, SET_SIGNATURE);
     // NVDATA.
     assert_eq!((rig.status(1), rig.stored()), (0x10, stored));
     assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Pending);
@@ -98,8 +95,7 @@ fn neither_signature_nor_node_id_is_stored() {
     assert_eq!(rig.node.stored(), Poll::Ready(Err(StoreError::Failed)));
     assert_eq!(rig.stored(), stored);
     set_low(&rig, false);
-    rig.command(1, SET_SIGNATURE).unwrap();
-    rig.settle();
+    rig.work(1, SET_SIGNATURE);
     assert_eq!((rig.status(1), rig.stored().records[0].map(|(.., signed, _)| signed)), (0, Some(true)));
 }
 
