@@ -4,6 +4,7 @@ use canopen::sdo::client::{Block, Buffer, Config, Download, SdoError, Step, Tran
 use canopen::sdo::server::Config as ServerConfig;
 use canopen::{AbortCode, Address};
 use kit::bus::{at, node, request, response, Bench, Event};
+use kit::crc::crc16;
 
 /// CRC of the bytes 1 to 9 (polynomial 1021h, start 0), from an independent calculation:
 /// `python3 -c "import binascii; print(hex(binascii.crc_hqx(bytes(range(1, 10)), 0)))"`.
@@ -198,10 +199,9 @@ fn server_aborts_a_block_download_that_is_wrong() {
     breaks(&[start, ([0x05, 1, 2, 3, 4, 5, 6, 7], &[abort(0x0504_0003)])]);
     // Sizes: more and fewer than announced. (n = 4 instead of 5; n = 6.)
     breaks(&[start, (FIRST, &[]), ([0x02, 8, 9, 10, 11, 12, 13, 14], &[abort(0x0607_0010)])]);
-    let crc = |bytes: &[u8]| crc_hqx(bytes).to_le_bytes();
-    let [low, high] = crc(&[1, 2, 3, 4, 5, 6, 7, 8]);
+    let [low, high] = crc16(&[1, 2, 3, 4, 5, 6, 7, 8]).to_le_bytes();
     breaks(&[start, (FIRST, &[]), last, ([0xD9, low, high, 0, 0, 0, 0, 0], &[abort(0x0607_0010)])]);
-    let [low, high] = crc(&[1, 2, 3, 4, 5, 6, 7, 8, 9, 0]);
+    let [low, high] = crc16(&[1, 2, 3, 4, 5, 6, 7, 8, 9, 0]).to_le_bytes();
     breaks(&[start, (FIRST, &[]), last, ([0xD1, low, high, 0, 0, 0, 0, 0], &[abort(0x0607_0010)])]);
     // Another frame where the end is expected.
     breaks(&[start, (FIRST, &[]), last, ([0x60, 0, 0, 0, 0, 0, 0, 0], &[abort(0x0504_0001)])]);
@@ -233,15 +233,12 @@ fn server_aborts_a_block_download_that_is_wrong() {
     bench.still_serves();
 }
 
-/// CRC-16 from its definition (CiA 301 section 7.2.4.3.16), implemented again: x^16 + x^12 + x^5 +
-/// 1, start 0.
-fn crc_hqx(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0_u16, |crc, byte| {
-        (0..8).fold(
-            crc ^ u16::from(*byte) << 8,
-            |crc, _| if crc >> 15 == 1 { crc << 1 ^ 0x1021 } else { crc << 1 },
-        )
-    })
+/// A device whose domain has the bytes 1 to 14.
+fn bench_with_14() -> Bench {
+    let mut bench = bench(127);
+    bench.device.domain = (1..=14).collect();
+    bench.device.tells_size = true;
+    bench
 }
 
 const READ_14: [u8; 8] = [0xA4, 0x00, 0x20, 0, 127, 0, 0, 0];
@@ -251,9 +248,7 @@ const END_OF_14: [u8; 8] = [0xC1, CRC_14[0], CRC_14[1], 0, 0, 0, 0, 0];
 
 #[test]
 fn server_gives_a_block_upload() {
-    let mut bench = bench(127);
-    bench.device.domain = (1..=14).collect();
-    bench.device.tells_size = true;
+    let mut bench = bench_with_14();
     bench.expect(&[
         (READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]),
         (START, &[FIRST, LAST_OF_14]),
@@ -283,16 +278,14 @@ fn server_gives_a_block_upload() {
             ],
         ),
     ]);
-    let [low, high] = crc_hqx(b"coboot bootloader").to_le_bytes();
+    let [low, high] = crc16(b"coboot bootloader").to_le_bytes();
     bench.expect(&[(acked(3, 10), &[[0xD1, low, high, 0, 0, 0, 0, 0]]), (ENDED, &[])]);
     assert!(bench.server.is_idle());
 }
 
 #[test]
 fn server_repeats_what_the_client_did_not_get() {
-    let mut bench = bench(127);
-    bench.device.domain = (1..=14).collect();
-    bench.device.tells_size = true;
+    let mut bench = bench_with_14();
     bench.expect(&[
         (READ_14, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]),
         (START, &[FIRST, LAST_OF_14]),
@@ -321,9 +314,7 @@ fn server_repeats_what_the_client_did_not_get() {
 
 #[test]
 fn server_switches_the_protocol_below_the_threshold() {
-    let mut bench = bench(127);
-    bench.device.domain = (1..=14).collect();
-    bench.device.tells_size = true;
+    let mut bench = bench_with_14();
     bench.expect(&[
         ([0xA4, 0x00, 0x20, 0, 127, 13, 0, 0], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]),
         ([0xA4, 0x00, 0x20, 0, 127, 14, 0, 0], &[[0x41, 0x00, 0x20, 0, 14, 0, 0, 0]]),
@@ -345,9 +336,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
         [0x80, 0x00, 0x20, 0, a, b, c, d]
     };
     let breaks = |dialogue: &[([u8; 8], &[[u8; 8]])]| {
-        let mut bench = bench(127);
-        bench.device.domain = (1..=14).collect();
-        bench.device.tells_size = true;
+        let mut bench = bench_with_14();
         bench.expect(dialogue);
         bench.still_serves();
     };
@@ -374,9 +363,7 @@ fn server_aborts_a_block_upload_that_is_wrong() {
     breaks(&[read, start, (acked(2, 127), &[END_OF_14]), give_up]);
     // Silence, at every stage.
     for stage in 1..=3 {
-        let mut bench = bench(127);
-        bench.device.domain = (1..=14).collect();
-        bench.device.tells_size = true;
+        let mut bench = bench_with_14();
         bench.expect(&[read, start, (acked(2, 127), &[END_OF_14])][..stage]);
         bench.now += 1000;
         assert_eq!(bench.sent(), [response(abort(0x0504_0000))]);
@@ -473,10 +460,9 @@ fn client_repeats_what_the_server_did_not_get() {
     // A server that never receives anything is given up.
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG);
     asks(&mut client, 0, &[INITIATE_9], &[granted(127)]);
-    for _ in 0..9 {
+    for _ in 0..10 {
         asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(0, 127)]);
     }
-    asks(&mut client, 0, &[FIRST, LAST_OF_9], &[acked(0, 127)]);
     let given_up = [0x80, 0x50, 0x1F, 1, 0x03, 0x00, 0x04, 0x05];
     ends(&mut client, 0, &[given_up], Err(SdoError::Client(AbortCode(0x0504_0003))));
 }
@@ -554,14 +540,16 @@ fn client_makes_a_block_upload() {
     assert_eq!(client.into_sink(), [1, 2]);
 }
 
+/// An upload whose first sub-block may come.
+fn upload() -> Upload<Vec<u8>> {
+    let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
+    asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+    sends(&mut client, 0, &[START]);
+    client
+}
+
 #[test]
 fn client_asks_again_for_what_was_lost() {
-    let upload = || {
-        let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-        asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
-        sends(&mut client, 0, &[START]);
-        client
-    };
     let mut client = upload();
     hears(&mut client, 0, &[LAST_OF_14]);
     asks(&mut client, 0, &[acked(0, 127)], &[FIRST, LAST_OF_14]);
@@ -627,14 +615,12 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
     ends(&mut client, 0, &[], Err(SdoError::Server(AbortCode(0x0606_0000))));
 
     let upload = |heard: &[[u8; 8]]| {
-        let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, BLOCK);
-        asks(&mut client, 0, &[READ_14], &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
-        sends(&mut client, 0, &[START]);
+        let mut client = upload();
         hears(&mut client, 0, heard);
         while let Step::Send(_) = client.poll(at(0)) {}
         client
     };
-    let [low, high] = crc_hqx(&(1..=13).collect::<Vec<u8>>()).to_le_bytes();
+    let [low, high] = crc16(&(1..=13).collect::<Vec<u8>>()).to_le_bytes();
     for (before, wrong, code) in [
         (&[][..], [0x00, 1, 2, 3, 4, 5, 6, 7], 0x0504_0003),
         (&[FIRST, LAST_OF_14], [0xC1, CRC_14[0] ^ 0x80, CRC_14[1], 0, 0, 0, 0, 0], 0x0504_0004),

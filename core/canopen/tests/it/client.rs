@@ -1,10 +1,13 @@
 //! The SDO client against answers written by hand from CiA 301 section 7.2.4.3.
 
-use canopen::sdo::client::{Buffer, Config, Download, SdoError, Step, Transfer, Upload};
+use canopen::sdo::client::{Block, Buffer, Config, Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame};
 use kit::bus::{at, node, request, response};
 
 const CONFIG: Config = Config { timeout_ms: 1000 };
+const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
+const OBJECT: Address = Address::new(0x2000, 3);
+const NINE: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
 
 /// A client and the bytes that it must send next, or its end.
 #[track_caller]
@@ -38,11 +41,11 @@ fn aborts(client: &mut impl Transfer, now: u32, bytes: [u8; 8], error: SdoError)
 }
 
 fn download(data: &[u8]) -> Download<&[u8]> {
-    Download::new(node(), Address::new(0x2000, 3), data, CONFIG)
+    Download::new(node(), OBJECT, data, CONFIG)
 }
 
 fn upload() -> Upload<Vec<u8>> {
-    Upload::new(node(), Address::new(0x2000, 3), Vec::new(), CONFIG)
+    Upload::new(node(), OBJECT, Vec::new(), CONFIG)
 }
 
 #[test]
@@ -158,20 +161,17 @@ fn a_buffer_is_asked_when_the_size_is_announced() {
 
 #[test]
 fn an_abort_of_the_server_is_reported() {
-    let abort = response([0x80, 0x00, 0x20, 3, 0x30, 0x00, 0x09, 0x06]);
+    let abort = [0x80, 0x00, 0x20, 3, 0x30, 0x00, 0x09, 0x06];
     let error = Err(SdoError::Server(AbortCode(0x0609_0030)));
     let mut client = download(&[1]);
-    sends(&mut client, 0, [0x2F, 0x00, 0x20, 3, 1, 0, 0, 0]);
-    client.handle(&abort, at(0));
+    asks(&mut client, 0, [0x2F, 0x00, 0x20, 3, 1, 0, 0, 0], abort);
     ends(&mut client, 0, error);
     let mut client = download(&[1, 2, 3, 4, 5]);
     asks(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]);
-    sends(&mut client, 0, [0x05, 1, 2, 3, 4, 5, 0, 0]);
-    client.handle(&abort, at(0));
+    asks(&mut client, 0, [0x05, 1, 2, 3, 4, 5, 0, 0], abort);
     ends(&mut client, 0, error);
     let mut client = upload();
-    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
-    client.handle(&abort, at(0));
+    asks(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0], abort);
     ends(&mut client, 0, error);
     assert_eq!(
         SdoError::Server(AbortCode(0x0609_0030)).to_string(),
@@ -286,21 +286,17 @@ fn a_caller_can_give_up() {
 /// neither success nor failure of this one.
 #[test]
 fn an_answer_about_another_object_is_no_answer() {
-    use canopen::sdo::client::Block;
-    const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
-    let object = Address::new(0x2000, 3);
-    let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
-    /// A client that waits, the answer to it without the object, and what it sends next, if it has
+    /// A client that waits, the answer to it without the OBJECT, and what it sends next, if it has
     /// not ended.
     type Case = (Box<dyn Transfer>, u8, [u8; 4], Option<u8>);
     let cases: Vec<Case> = vec![
         (Box::new(download(&[1])), 0x60, [0; 4], None),
-        (Box::new(download(nine)), 0x60, [0; 4], Some(0x00)),
+        (Box::new(download(NINE)), 0x60, [0; 4], Some(0x00)),
         (Box::new(upload()), 0x4F, [7, 0, 0, 0], None),
         (Box::new(upload()), 0x41, [9, 0, 0, 0], Some(0x60)),
-        (Box::new(Download::as_blocks(node(), object, nine, CONFIG)), 0xA4, [127, 0, 0, 0], Some(0x01)),
+        (Box::new(Download::as_blocks(node(), OBJECT, NINE, CONFIG)), 0xA4, [127, 0, 0, 0], Some(0x01)),
         (
-            Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK)),
+            Box::new(Upload::as_blocks(node(), OBJECT, Vec::new(), CONFIG, BLOCK)),
             0xC6,
             [9, 0, 0, 0],
             Some(0xA3),
@@ -328,17 +324,13 @@ fn an_answer_about_another_object_is_no_answer() {
 /// another object does not end this transfer, wherever it comes.
 #[test]
 fn an_abort_for_another_object_is_no_answer() {
-    use canopen::sdo::client::Block;
-    const BLOCK: Block = Block { blksize: 127, pst: 0, repeat_ms: 300 };
-    let object = Address::new(0x2000, 3);
-    let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
-    let block_download = || Box::new(Download::as_blocks(node(), object, nine, CONFIG));
-    let block_upload = || Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK));
+    let block_download = || Box::new(Download::as_blocks(node(), OBJECT, NINE, CONFIG));
+    let block_upload = || Box::new(Upload::as_blocks(node(), OBJECT, Vec::new(), CONFIG, BLOCK));
     /// A client, and the answers after which it waits.
     type Case = (&'static str, Box<dyn Transfer>, Vec<[u8; 8]>);
     let cases: Vec<Case> = vec![
         ("expedited download", Box::new(download(&[1])), vec![]),
-        ("segmented download", Box::new(download(nine)), vec![[0x60, 0x00, 0x20, 3, 0, 0, 0, 0]]),
+        ("segmented download", Box::new(download(NINE)), vec![[0x60, 0x00, 0x20, 3, 0, 0, 0, 0]]),
         ("upload", Box::new(upload()), vec![]),
         ("segmented upload", Box::new(upload()), vec![[0x41, 0x00, 0x20, 3, 9, 0, 0, 0]]),
         ("block download, begun", block_download(), vec![]),
@@ -409,8 +401,7 @@ fn answers_to_the_attempt_before_are_passed_over() {
     client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(6));
     ends(&mut client, 6, Ok(()));
     // A download whose first initiate was answered late: the second answer comes in its segments.
-    let nine = [1, 2, 3, 4, 5, 6, 7, 8, 9];
-    let mut client = download(&nine);
+    let mut client = download(NINE);
     sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 9, 0, 0, 0]);
     client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(5));
     sends(&mut client, 5, [0x00, 1, 2, 3, 4, 5, 6, 7]);
@@ -418,7 +409,7 @@ fn answers_to_the_attempt_before_are_passed_over() {
     assert_eq!(client.poll(at(6)), Step::Wait(at(1005)));
     client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(7));
     sends(&mut client, 7, [0x1B, 8, 9, 0, 0, 0, 0, 0]);
-    let mut client = Download::as_blocks(node(), Address::new(0x2000, 3), &nine, CONFIG);
+    let mut client = Download::as_blocks(node(), OBJECT, NINE, CONFIG);
     sends(&mut client, 0, [0xC6, 0x00, 0x20, 3, 9, 0, 0, 0]);
     client.handle(&response([0xA4, 0x00, 0x20, 3, 127, 0, 0, 0]), at(5));
     assert_eq!(client.poll(at(5)), Step::Send(request([0x01, 1, 2, 3, 4, 5, 6, 7])));

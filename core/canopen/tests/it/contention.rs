@@ -32,7 +32,7 @@ impl Scene for Bench {
     /// Opens a block download of 1F50h/1 and sends its first segments.
     #[track_caller]
     fn begin(&mut self, segments: u8) {
-        assert_eq!(self.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(GRANTED)]);
+        assert_eq!(self.ask(INITIATE), [response(GRANTED)]);
         self.sends(1..=segments, [1, 2, 3, 4, 5, 6, 7]);
     }
 
@@ -45,6 +45,11 @@ impl Scene for Bench {
     }
 }
 
+const FAST: Config = Config { bit_rate: BitRate::K1000, ..Config::DEFAULT };
+const CLEAR: [u8; 8] = [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0];
+const CLEARED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+/// A block download of 4096 bytes.
+const INITIATE: [u8; 8] = [0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0];
 const GRANTED: [u8; 8] = [0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0];
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10];
@@ -82,7 +87,7 @@ fn a_lost_last_segment_is_acknowledged_after_50_ms_and_a_pause_after_250() {
     for (bit_rate, pause) in [(BitRate::K50, 50), (BitRate::K20, 100), (BitRate::K10, 100)] {
         let mut bench = Bench::with(Config { blksize: 3, bit_rate, ..Config::DEFAULT });
         let granted = [0xA4, 0x50, 0x1F, 1, 3, 0, 0, 0];
-        assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(granted)]);
+        assert_eq!(bench.ask(INITIATE), [response(granted)]);
         bench.sends(1..=2, [1, 2, 3, 4, 5, 6, 7]);
         assert_eq!(bench.wait(300), [(pause, response([0xA2, 2, 3, 0, 0, 0, 0, 0]))], "{bit_rate:?}");
     }
@@ -105,7 +110,7 @@ fn a_sub_block_fits_into_the_time_out_of_a_client_at_each_bit_rate() {
     ] {
         let mut bench = Bench::with(Config { bit_rate, ..Config::DEFAULT });
         let granted = [0xA4, 0x50, 0x1F, 1, segments, 0, 0, 0];
-        assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(granted)], "{bit_rate:?}");
+        assert_eq!(bench.ask(INITIATE), [response(granted)], "{bit_rate:?}");
         for seqno in 1..segments {
             assert_eq!(bench.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), [], "{bit_rate:?}");
         }
@@ -116,7 +121,7 @@ fn a_sub_block_fits_into_the_time_out_of_a_client_at_each_bit_rate() {
 
 /// The server aborts a download at this segment, because there are more data than were announced.
 fn aborted_at(place: u8, second: Option<Channel>) -> Bench {
-    let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+    let mut bench = Bench::with(FAST);
     bench.device.second = second;
     let [low, high] = (7 * u16::from(place) - 1).to_le_bytes();
     assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, low, high, 0, 0]), [response(GRANTED)]);
@@ -154,8 +159,6 @@ fn segments_after_an_abort_are_no_requests_and_a_read_is() {
 /// last segment, and nothing after a pause.
 #[test]
 fn any_other_frame_after_an_abort_is_a_request_at_once() {
-    const CLEAR: [u8; 8] = [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0];
-    const CLEARED: [u8; 8] = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
     for place in (1..127).filter(|place| *place != 0x2E) {
         let mut bench = aborted_at(place, None);
         assert_eq!(bench.ask(CLEAR), [response(CLEARED)], "after {place}");
@@ -186,7 +189,7 @@ fn any_other_frame_after_an_abort_is_a_request_at_once() {
     for place in 1..127 {
         let mut bench = aborted_at(place, None);
         if place == 0x41 {
-            assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), []);
+            assert_eq!(bench.ask(INITIATE), []);
         }
         bench.begin(126);
         assert_eq!(bench.ask([127, 1, 2, 3, 4, 5, 6, 7]), [response(acked(127))], "after {place}");
@@ -201,7 +204,7 @@ fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
     // Not 2Ah: the other client's request would have the number that is due.
     for place in (1..126).filter(|place| *place != 0x2A) {
         for is_timed_out in [true, false] {
-            let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+            let mut bench = Bench::with(FAST);
             bench.begin(place);
             if is_timed_out {
                 let said = bench.wait(2300);
@@ -222,12 +225,11 @@ fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
             // Any other frame, and any frame after a pause, is a request.
             assert_eq!(bench.ask(READ_1000), [response(IS_1000)]);
             bench.now += 3;
-            let cleared = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
-            assert_eq!(bench.ask([0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0]), [response(cleared)]);
+            assert_eq!(bench.ask(CLEAR), [response(CLEARED)]);
         }
     }
     // A request with the number that is due, and the next one with its successor's.
-    let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+    let mut bench = Bench::with(FAST);
     bench.begin(0x21);
     bench.wait(2300);
     for (asked, at) in [(0x22, 0x2002), (0x23, 0x2002)] {
@@ -242,7 +244,7 @@ fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
 fn a_server_that_is_alone_passes_the_rest_of_a_sub_block_over_too() {
     for place in 1..126 {
         let mut device = DeviceOf::<false>::default();
-        let mut server = SdoServer::new(node(), Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+        let mut server = SdoServer::new(node(), FAST);
         let mut ask = |ms, bytes: Option<[u8; 8]>| {
             if let Some(bytes) = bytes {
                 server.handle(&request(bytes), at(ms), &mut device);
@@ -250,7 +252,7 @@ fn a_server_that_is_alone_passes_the_rest_of_a_sub_block_over_too() {
             let answer = server.poll(at(ms), &mut device);
             (answer, device.control)
         };
-        assert_eq!(ask(0, Some([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0])).0, Some(response(GRANTED)));
+        assert_eq!(ask(0, Some(INITIATE)).0, Some(response(GRANTED)));
         for seqno in 1..=place {
             assert_eq!(ask(0, Some([seqno, 1, 2, 3, 4, 5, 6, 7])).0, None);
         }
@@ -263,7 +265,7 @@ fn a_server_that_is_alone_passes_the_rest_of_a_sub_block_over_too() {
             assert_eq!(after, (None, 0), "{seqno} after {place}");
         }
         // A new download is served from its first segment on.
-        assert_eq!(ask(2300, Some([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0])).0, Some(response(GRANTED)));
+        assert_eq!(ask(2300, Some(INITIATE)).0, Some(response(GRANTED)));
         for seqno in 1..=126 {
             assert_eq!(ask(2300, Some([seqno, 1, 2, 3, 4, 5, 6, 7])).0, None);
         }
@@ -299,10 +301,10 @@ fn a_transfer_after_an_abort_is_served_at_each_place() {
 fn another_servers_download_makes_no_requests_of_segments() {
     let second = Channel { request: CobId::new(0x6A0).unwrap(), response: CobId::new(0x1A0).unwrap() };
     for place in 1..126 {
-        let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+        let mut bench = Bench::with(FAST);
         bench.device.second = Some(second);
         bench.begin(place);
-        let initiate = Frame::full(second.request, [0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]);
+        let initiate = Frame::full(second.request, INITIATE);
         bench.server.handle(&initiate, at(bench.now), &mut bench.device);
         assert_eq!(bench.sent(), [Frame::full(second.response, GRANTED)]);
         for seqno in place + 1..=126 {
@@ -411,7 +413,7 @@ fn each_kind_of_request_ends_a_download() {
         let mut bench = Bench::with(Config { blksize: 2, ..Config::DEFAULT });
         bench.device.space = Some(14);
         let granted = [0xA4, 0x50, 0x1F, 1, 2, 0, 0, 0];
-        assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(granted)]);
+        assert_eq!(bench.ask(INITIATE), [response(granted)]);
         assert_eq!(bench.ask([1, 1, 2, 3, 4, 5, 6, 7]), []);
         assert_eq!(bench.ask([2, 1, 2, 3, 4, 5, 6, 7]), []);
         assert_eq!(bench.wait(10), []);

@@ -451,30 +451,23 @@ fn a_value_of_the_wrong_length_is_the_devices_fault() {
         }
     }
     let mut server = SdoServer::new(node(), Config::default());
-    let mut device = Wrong(Device::default(), usize::MAX);
-    let mut ask = |device: &mut Wrong, bytes| {
-        server.handle(&request(bytes), at(0), device);
-        *server.poll(at(0), device).unwrap().exactly::<8>().unwrap()
-    };
-    assert_eq!(
-        ask(&mut device, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
-        [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]
-    );
-    assert_eq!(
-        ask(&mut device, [0x40, 0x01, 0x20, 0, 0, 0, 0, 0]),
-        [0x80, 0x01, 0x20, 0, 0x47, 0x00, 0x04, 0x06]
-    );
-    assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
-    assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x00; 8]);
-    assert_eq!(ask(&mut device, [0x70, 0, 0, 0, 0, 0, 0, 0]), [0x1D, 0, 0, 0, 0, 0, 0, 0]);
-    // Three bytes of an Unsigned32; a domain that ends before its announced size.
-    device.1 = 3;
-    assert_eq!(
-        ask(&mut device, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0]),
-        [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]
-    );
-    assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
-    assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x80, 0x00, 0x20, 0, 0x47, 0x00, 0x04, 0x06]);
+    let mut device = Wrong(Device::default(), 0);
+    for (len, asked, answered) in [
+        (usize::MAX, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]),
+        (usize::MAX, [0x40, 0x01, 0x20, 0, 0, 0, 0, 0], [0x80, 0x01, 0x20, 0, 0x47, 0x00, 0x04, 0x06]),
+        (usize::MAX, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0], [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]),
+        (usize::MAX, [0x60, 0, 0, 0, 0, 0, 0, 0], [0x00; 8]),
+        (usize::MAX, [0x70, 0, 0, 0, 0, 0, 0, 0], [0x1D, 0, 0, 0, 0, 0, 0, 0]),
+        // Three bytes of an Unsigned32; a domain that ends before its announced size.
+        (3, [0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x80, 0x00, 0x10, 0, 0x47, 0x00, 0x04, 0x06]),
+        (3, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0], [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]),
+        (3, [0x60, 0, 0, 0, 0, 0, 0, 0], [0x80, 0x00, 0x20, 0, 0x47, 0x00, 0x04, 0x06]),
+    ] {
+        device.1 = len;
+        server.handle(&request(asked), at(0), &mut device);
+        let answer = server.poll(at(0), &mut device).unwrap();
+        assert_eq!(answer.exactly(), Some(&answered), "{len} bytes, {asked:02X?}");
+    }
 }
 
 /// The longest value fills the server's room.

@@ -105,6 +105,13 @@ impl Bench {
         Self { slave, device: Device::default(), now: 0 }
     }
 
+    /// A device that has said its boot-up.
+    fn joined() -> Self {
+        let mut bench = Self::new(5, BitRate::K125);
+        bench.outputs();
+        bench
+    }
+
     fn outputs(&mut self) -> Vec<Output> {
         core::iter::from_fn(|| self.slave.poll(at(self.now), true, &mut self.device)).take(20).collect()
     }
@@ -240,8 +247,7 @@ fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {
 
 #[test]
 fn reset_communication_takes_over_what_lss_configured() {
-    let mut bench = Bench::new(5, BitRate::K125);
-    bench.outputs();
+    let mut bench = Bench::joined();
     bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     bench.ask(0x7E5, &[0x11, 9, 0, 0, 0, 0, 0, 0]);
     let outputs = bench.ask(0x000, &[0x82, 5]);
@@ -257,8 +263,7 @@ fn reset_communication_takes_over_what_lss_configured() {
 #[test]
 fn reset_communication_ends_the_configuration_state() {
     let inquire = [0x5E, 0, 0, 0, 0, 0, 0, 0];
-    let mut bench = Bench::new(5, BitRate::K125);
-    bench.outputs();
+    let mut bench = Bench::joined();
     bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     for command in [0x01, 0x02, 0x80] {
         assert_eq!(bench.ask(0x000, &[command, 5]), []);
@@ -294,8 +299,7 @@ fn reset_node_ends_a_transfer_at_once() {
         (None, &[[0xA0, 0x00, 0x20, 0, 127, 0, 0, 0], [0xA3, 0, 0, 0, 0, 0, 0, 0]]),
     ];
     for (space, requests) in transfers {
-        let mut bench = Bench::new(5, BitRate::K125);
-        bench.outputs();
+        let mut bench = Bench::joined();
         bench.device.space = space;
         for request in requests {
             bench.ask(0x605, request);
@@ -357,8 +361,7 @@ fn sub_blocks_follow_the_bit_rate() {
 
 #[test]
 fn reset_node_is_the_owners() {
-    let mut bench = Bench::new(5, BitRate::K125);
-    bench.outputs();
+    let mut bench = Bench::joined();
     assert!(!bench.put(0x000, &[0x81, 6]), "of another node");
     assert!(bench.put(0x000, &[0x81, 5]));
     assert!(bench.put(0x000, &[0x81, 0]));
@@ -367,8 +370,7 @@ fn reset_node_is_the_owners() {
 #[test]
 fn the_answer_to_store_waits_for_the_memory() {
     for (outcome, code) in [(Ok(()), 0), (Err(StoreError::Failed), 2)] {
-        let mut bench = Bench::new(5, BitRate::K125);
-        bench.outputs();
+        let mut bench = Bench::joined();
         bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
         assert_eq!(bench.ask(0x7E5, &[0x17, 0, 0, 0, 0, 0, 0, 0]), []);
         assert_eq!(bench.device.stored, Some((NodeId::new(5), None)));
@@ -396,8 +398,7 @@ fn listens_until_a_frame_proves_the_bit_rate() {
 
 #[test]
 fn activates_a_bit_rate_and_keeps_silent_meanwhile() {
-    let mut bench = Bench::new(5, BitRate::K125);
-    bench.outputs();
+    let mut bench = Bench::joined();
     bench.ask(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     bench.ask(0x7E5, &[0x13, 0, 2, 0, 0, 0, 0, 0]);
     bench.ask(0x7E5, &[0x15, 100, 0, 0, 0, 0, 0, 0]);
@@ -426,8 +427,7 @@ fn a_slave_is_idle_when_no_answer_waits() {
 
 #[test]
 fn a_heartbeat_that_is_set_is_sent_and_stays_behind_a_restart() {
-    let mut bench = Bench::new(5, BitRate::K125);
-    bench.outputs();
+    let mut bench = Bench::joined();
     bench.slave.set_heartbeat_ms(100, at(0));
     bench.now = 99;
     assert_eq!(bench.outputs(), []);

@@ -9,6 +9,7 @@ use canopen::sdo::client::{Config as ClientConfig, Download, Step, Transfer};
 use canopen::sdo::server::Config;
 use canopen::{Address, BitRate, Frame};
 use kit::bus::{at, node, request, Bench};
+use kit::crc::crc16;
 use kit::random::Random;
 
 /// The most bits of a frame with eight bytes, with stuff bits and the intermission (ISO 11898-1).
@@ -122,13 +123,6 @@ fn attentive(wire: &mut Wire, data: &[u8]) -> Result<(), String> {
             Step::Done(result) => return result.map_err(|error| error.to_string()),
         }
     }
-}
-
-/// CRC-16 of CiA 301 section 7.2.4.3.16, bit by bit.
-fn crc16(data: &[u8]) -> u16 {
-    data.iter().fold(0, |crc, byte| {
-        (0..8).fold(crc ^ u16::from(*byte) << 8, |crc, _| crc << 1 ^ (0x1021 * (crc >> 15)))
-    })
 }
 
 /// A client that reads only after the whole sub-block, written from CiA 301 sections 7.2.4.3.9 ff.

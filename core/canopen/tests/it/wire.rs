@@ -1,58 +1,45 @@
 //! Frames of every SDO service, written by hand from the figures of CiA 301 section 7.2.4.3: each
 //! is parsed and emitted again.
 
-use canopen::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
+use canopen::sdo::wire::Payload::{Expedited, Segmented, Unsized};
+use canopen::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Request, Response, Segment};
 use canopen::AbortCode;
 use canopen::Address;
 
 const AT: Address = Address::new(0x1F50, 2);
 
+fn segment(toggle: bool, last: bool, data: &[u8]) -> Segment {
+    Segment { toggle, last, data: Chunk::new(data) }
+}
+
 #[test]
 fn requests() {
+    use Request::*;
     let table = [
-        (
-            [0x27, 0x50, 0x1F, 2, 1, 2, 3, 0],
-            Request::InitiateDownload(AT, Payload::Expedited(Chunk::new(&[1, 2, 3]))),
-        ),
-        ([0x22, 0x50, 0x1F, 2, 1, 2, 3, 4], Request::InitiateDownload(AT, Payload::Unsized([1, 2, 3, 4]))),
-        (
-            [0x21, 0x50, 0x1F, 2, 0x78, 0x56, 0x34, 0x12],
-            Request::InitiateDownload(AT, Payload::Segmented(Some(0x1234_5678))),
-        ),
-        ([0x20, 0x50, 0x1F, 2, 0, 0, 0, 0], Request::InitiateDownload(AT, Payload::Segmented(None))),
-        (
-            [0x00, 1, 2, 3, 4, 5, 6, 7],
-            Request::DownloadSegment(Segment {
-                toggle: false,
-                last: false,
-                data: Chunk::new(&[1, 2, 3, 4, 5, 6, 7]),
-            }),
-        ),
-        (
-            [0x1B, 1, 2, 0, 0, 0, 0, 0],
-            Request::DownloadSegment(Segment { toggle: true, last: true, data: Chunk::new(&[1, 2]) }),
-        ),
-        ([0x40, 0x50, 0x1F, 2, 0, 0, 0, 0], Request::InitiateUpload(AT)),
-        ([0x60, 0, 0, 0, 0, 0, 0, 0], Request::UploadSegment(false)),
-        ([0x70, 0, 0, 0, 0, 0, 0, 0], Request::UploadSegment(true)),
-        ([0x80, 0x50, 0x1F, 2, 0x01, 0x00, 0x04, 0x05], Request::Abort(AT, AbortCode(0x0504_0001))),
+        ([0x27, 0x50, 0x1F, 2, 1, 2, 3, 0], InitiateDownload(AT, Expedited(Chunk::new(&[1, 2, 3])))),
+        ([0x22, 0x50, 0x1F, 2, 1, 2, 3, 4], InitiateDownload(AT, Unsized([1, 2, 3, 4]))),
+        ([0x21, 0x50, 0x1F, 2, 0x78, 0x56, 0x34, 0x12], InitiateDownload(AT, Segmented(Some(0x1234_5678)))),
+        ([0x20, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateDownload(AT, Segmented(None))),
+        ([0x00, 1, 2, 3, 4, 5, 6, 7], DownloadSegment(segment(false, false, &[1, 2, 3, 4, 5, 6, 7]))),
+        ([0x1B, 1, 2, 0, 0, 0, 0, 0], DownloadSegment(segment(true, true, &[1, 2]))),
+        ([0x40, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateUpload(AT)),
+        ([0x60, 0, 0, 0, 0, 0, 0, 0], UploadSegment(false)),
+        ([0x70, 0, 0, 0, 0, 0, 0, 0], UploadSegment(true)),
+        ([0x80, 0x50, 0x1F, 2, 0x01, 0x00, 0x04, 0x05], Abort(AT, AbortCode(0x0504_0001))),
         (
             [0xC6, 0x50, 0x1F, 2, 0x00, 0x01, 0, 0],
-            Request::InitiateBlockDownload { at: AT, crc: true, size: Some(256) },
+            InitiateBlockDownload { at: AT, crc: true, size: Some(256) },
         ),
-        (
-            [0xC0, 0x50, 0x1F, 2, 0, 0, 0, 0],
-            Request::InitiateBlockDownload { at: AT, crc: false, size: None },
-        ),
-        ([0xC1, 0x34, 0x12, 0, 0, 0, 0, 0], Request::EndBlockDownload(BlockEnd { unused: 0, crc: 0x1234 })),
-        ([0xD9, 0x34, 0x12, 0, 0, 0, 0, 0], Request::EndBlockDownload(BlockEnd { unused: 6, crc: 0x1234 })),
+        ([0xC0, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateBlockDownload { at: AT, crc: false, size: None }),
+        ([0xC1, 0x34, 0x12, 0, 0, 0, 0, 0], EndBlockDownload(BlockEnd { unused: 0, crc: 0x1234 })),
+        ([0xD9, 0x34, 0x12, 0, 0, 0, 0, 0], EndBlockDownload(BlockEnd { unused: 6, crc: 0x1234 })),
         (
             [0xA4, 0x50, 0x1F, 2, 127, 20, 0, 0],
-            Request::InitiateBlockUpload { at: AT, crc: true, blksize: 127, pst: 20 },
+            InitiateBlockUpload { at: AT, crc: true, blksize: 127, pst: 20 },
         ),
-        ([0xA1, 0, 0, 0, 0, 0, 0, 0], Request::EndBlockUpload),
-        ([0xA2, 5, 64, 0, 0, 0, 0, 0], Request::AckBlockUpload(BlockAck { ackseq: 5, blksize: 64 })),
-        ([0xA3, 0, 0, 0, 0, 0, 0, 0], Request::StartBlockUpload),
+        ([0xA1, 0, 0, 0, 0, 0, 0, 0], EndBlockUpload),
+        ([0xA2, 5, 64, 0, 0, 0, 0, 0], AckBlockUpload(BlockAck { ackseq: 5, blksize: 64 })),
+        ([0xA3, 0, 0, 0, 0, 0, 0, 0], StartBlockUpload),
     ];
     for (bytes, fields) in table {
         assert_eq!(Request::parse(&bytes), Some(fields));
@@ -63,42 +50,24 @@ fn requests() {
 
 #[test]
 fn responses() {
+    use Response::*;
     let table = [
-        ([0x60, 0x50, 0x1F, 2, 0, 0, 0, 0], Response::InitiateDownload(AT)),
-        ([0x20, 0, 0, 0, 0, 0, 0, 0], Response::DownloadSegment(false)),
-        ([0x30, 0, 0, 0, 0, 0, 0, 0], Response::DownloadSegment(true)),
-        (
-            [0x4F, 0x50, 0x1F, 2, 1, 0, 0, 0],
-            Response::InitiateUpload(AT, Payload::Expedited(Chunk::new(&[1]))),
-        ),
-        ([0x42, 0x50, 0x1F, 2, 1, 2, 3, 4], Response::InitiateUpload(AT, Payload::Unsized([1, 2, 3, 4]))),
-        ([0x41, 0x50, 0x1F, 2, 8, 0, 0, 0], Response::InitiateUpload(AT, Payload::Segmented(Some(8)))),
-        ([0x40, 0x50, 0x1F, 2, 0, 0, 0, 0], Response::InitiateUpload(AT, Payload::Segmented(None))),
-        (
-            [0x10, 1, 2, 3, 4, 5, 6, 7],
-            Response::UploadSegment(Segment {
-                toggle: true,
-                last: false,
-                data: Chunk::new(&[1, 2, 3, 4, 5, 6, 7]),
-            }),
-        ),
-        (
-            [0x0F, 0, 0, 0, 0, 0, 0, 0],
-            Response::UploadSegment(Segment { toggle: false, last: true, data: Chunk::new(&[]) }),
-        ),
-        ([0x80, 0x50, 0x1F, 2, 0x11, 0x00, 0x09, 0x06], Response::Abort(AT, AbortCode(0x0609_0011))),
-        (
-            [0xA4, 0x50, 0x1F, 2, 127, 0, 0, 0],
-            Response::InitiateBlockDownload { at: AT, crc: true, blksize: 127 },
-        ),
-        ([0xA1, 0, 0, 0, 0, 0, 0, 0], Response::EndBlockDownload),
-        ([0xA2, 127, 10, 0, 0, 0, 0, 0], Response::AckBlockDownload(BlockAck { ackseq: 127, blksize: 10 })),
-        (
-            [0xC6, 0x50, 0x1F, 2, 3, 0, 0, 0],
-            Response::InitiateBlockUpload { at: AT, crc: true, size: Some(3) },
-        ),
-        ([0xC0, 0x50, 0x1F, 2, 0, 0, 0, 0], Response::InitiateBlockUpload { at: AT, crc: false, size: None }),
-        ([0xD1, 0xCD, 0xAB, 0, 0, 0, 0, 0], Response::EndBlockUpload(BlockEnd { unused: 4, crc: 0xABCD })),
+        ([0x60, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateDownload(AT)),
+        ([0x20, 0, 0, 0, 0, 0, 0, 0], DownloadSegment(false)),
+        ([0x30, 0, 0, 0, 0, 0, 0, 0], DownloadSegment(true)),
+        ([0x4F, 0x50, 0x1F, 2, 1, 0, 0, 0], InitiateUpload(AT, Expedited(Chunk::new(&[1])))),
+        ([0x42, 0x50, 0x1F, 2, 1, 2, 3, 4], InitiateUpload(AT, Unsized([1, 2, 3, 4]))),
+        ([0x41, 0x50, 0x1F, 2, 8, 0, 0, 0], InitiateUpload(AT, Segmented(Some(8)))),
+        ([0x40, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateUpload(AT, Segmented(None))),
+        ([0x10, 1, 2, 3, 4, 5, 6, 7], UploadSegment(segment(true, false, &[1, 2, 3, 4, 5, 6, 7]))),
+        ([0x0F, 0, 0, 0, 0, 0, 0, 0], UploadSegment(segment(false, true, &[]))),
+        ([0x80, 0x50, 0x1F, 2, 0x11, 0x00, 0x09, 0x06], Abort(AT, AbortCode(0x0609_0011))),
+        ([0xA4, 0x50, 0x1F, 2, 127, 0, 0, 0], InitiateBlockDownload { at: AT, crc: true, blksize: 127 }),
+        ([0xA1, 0, 0, 0, 0, 0, 0, 0], EndBlockDownload),
+        ([0xA2, 127, 10, 0, 0, 0, 0, 0], AckBlockDownload(BlockAck { ackseq: 127, blksize: 10 })),
+        ([0xC6, 0x50, 0x1F, 2, 3, 0, 0, 0], InitiateBlockUpload { at: AT, crc: true, size: Some(3) }),
+        ([0xC0, 0x50, 0x1F, 2, 0, 0, 0, 0], InitiateBlockUpload { at: AT, crc: false, size: None }),
+        ([0xD1, 0xCD, 0xAB, 0, 0, 0, 0, 0], EndBlockUpload(BlockEnd { unused: 4, crc: 0xABCD })),
     ];
     for (bytes, fields) in table {
         assert_eq!(Response::parse(&bytes), Some(fields));
