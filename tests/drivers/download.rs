@@ -6,7 +6,7 @@ use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use canopen::od::{Address, Entry, Objects};
-use kit::bench::{block, block_crc, node, CLEAR, CONFIG, SET_SIGNATURE};
+use kit::bench::{block, crc32, node, CLEAR, CONFIG, SET_SIGNATURE};
 use kit::boot::{leaked, Boot};
 use kit::model::{until_power_cut, Cut, ONE_PROGRAM};
 use shared_abi::layout::Layout;
@@ -51,7 +51,7 @@ fn image(fill: u8) -> Vec<u8> {
 
 /// CLEAR, the blocks, and the release; the status at the end, or of the first failure.
 fn update(device: &mut Device, image: &[u8]) -> u32 {
-    let last = [1024, block_crc(image)].map(u32::to_le_bytes).concat();
+    let last = [1024, crc32(image)].map(u32::to_le_bytes).concat();
     let blocks = [block(0, 0, &[0; 8]), block(1, REGION.base, image), block(u32::MAX, 0, &last)];
     let command = |device: &mut Device, value| {
         let _ = device.write(Address::new(0x1F51, SERIAL), &[value]);

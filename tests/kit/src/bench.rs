@@ -13,13 +13,12 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::boot::{leaked, Boot};
-use crate::rig::go_on;
 pub use crate::rig::{block, crc32};
+use crate::rig::{go_on, words};
 
 use crate::model::{ModelFlash, CHIP, ONE_PROGRAM};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
-pub static LAYOUT_REF: &Layout = &LAYOUT;
 pub const PROGRAM: Region = LAYOUT.programs[0];
 
 pub const DATA: Address = Address::new(0x1F50, 1);
@@ -38,7 +37,7 @@ pub const CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
     node_id: None,
-    layout: LAYOUT_REF,
+    layout: &LAYOUT,
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
     download: Policy::DEFAULT,
@@ -189,20 +188,13 @@ impl<'f> Bench<'f> {
     }
 }
 
-/// The CRC-32 of blocks and programs.
-pub fn block_crc(bytes: &[u8]) -> u32 {
-    crc32(bytes)
-}
-
 /// CRC-16 in the words of blocks and programs.
 pub fn crc16(bytes: &[u8]) -> u32 {
     crate::crc::crc16(bytes).into()
 }
 
 pub fn last(program: &[u8]) -> Vec<u8> {
-    let mut data = (program.len() as u32).to_le_bytes().to_vec();
-    data.extend(block_crc(program).to_le_bytes());
-    block(u32::MAX, 0, &data)
+    block(u32::MAX, 0, &words(&[program.len() as u32, crc32(program)]))
 }
 
 pub fn block_file(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {

@@ -24,7 +24,8 @@ pub const END_OF_FILE: &str = ":00000001FF";
 /// the address changes.
 pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
     let mut text = String::new();
-    for (address, data) in (base..).step_by(16).zip(bytes.chunks(16)) {
+    for (n, data) in (0..).zip(bytes.chunks(16)) {
+        let address = base.wrapping_add(16 * n);
         if address == base || address % 0x1_0000 == 0 {
             text += &record(0, 4, &((address >> 16) as u16).to_be_bytes());
             text.push('\n');

@@ -31,7 +31,7 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::boot::{takes_sealed, Boot};
 pub use crate::crc::{crc32, Crc};
-use crate::ihex::{record, END_OF_FILE};
+use crate::ihex::intel_hex;
 use crate::model::{Chip, ModelFlash, ONE_PROGRAM, TWO_PROGRAMS};
 use crate::renewal::{self, loads};
 
@@ -615,9 +615,14 @@ pub fn program(region: Region, product_code: u32, len: usize, seed: u8) -> Vec<u
     bytes
 }
 
-/// A program for this number of a setup, which is the seed and the version, too.
+/// A program for this number of a setup.
+pub fn image(setup: &Setup, number: u8, len: usize, seed: u8) -> Vec<u8> {
+    program(setup.region(number), PRODUCT_CODE, len, seed)
+}
+
+/// The same with the number as the seed, and the version.
 pub fn raw(setup: &Setup, number: u8, len: usize) -> Vec<u8> {
-    program(setup.region(number), PRODUCT_CODE, len, number)
+    image(setup, number, len, number)
 }
 
 pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
@@ -653,10 +658,5 @@ pub fn words(words: &[u32]) -> Vec<u8> {
 
 /// A program as Intel HEX, 16 bytes a record.
 pub fn hex(base: u32, program: &[u8]) -> Vec<u8> {
-    let mut text = record(0, 4, &((base >> 16) as u16).to_be_bytes()) + "\n";
-    for (n, data) in (0..).zip(program.chunks(16)) {
-        text += &record(base.wrapping_add(16 * n) as u16, 0, data);
-        text += "\n";
-    }
-    (text + END_OF_FILE + "\n").into_bytes()
+    intel_hex(base, program).into_bytes()
 }

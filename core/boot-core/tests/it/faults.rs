@@ -3,16 +3,12 @@
 
 use canopen::{BitRate, NodeId};
 use kit::model::{ModelFlash, CHIP};
-use kit::rig::{block, crc32, program, words, Rig, Setup, ESACADEMY_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
+use kit::rig::{block, crc32, image, words, Rig, ESACADEMY_2, STANDARD_1, STANDARD_2};
 
 use super::parameters::{header_of, slot};
 
 const CLEAR: u8 = 3;
 const BUFFER: usize = 1024;
-
-fn image(setup: &Setup, number: u8, len: usize, seed: u8) -> Vec<u8> {
-    program(setup.region(number), PRODUCT_CODE, len, seed)
-}
 
 /// The manual of ESAcademy: the password of a program makes it invalid, also while the flash still
 /// works on an aborted download of another program.

@@ -768,8 +768,7 @@ fn record(bench: &mut Bench<'_>) -> Option<ProgramRecord> {
 /// Only the confirmation marks a program that has returned the device; it is stored once.
 #[test]
 fn a_program_that_came_back_is_confirmed_once() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
+    let mut bench = Bench::new(new_flash());
     let confirmed = |bench: &mut Bench<'_>| record(bench).map(|record| record.confirmed);
     bench.node.confirm(1);
     bench.settle();
@@ -815,8 +814,7 @@ fn a_busy_device_confirms_nothing() {
 /// the program changes nothing.
 #[test]
 fn a_signature_waits_for_a_confirmation() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
+    let mut bench = Bench::new(new_flash());
     bench.install(&kit::bench::program(200, 0x11));
     for command in [SET_SIGNATURE, CLR_SIGNATURE] {
         bench.node.confirm(1);

@@ -8,7 +8,8 @@ use canopen::od::{Address, Objects};
 use canopen::{BitRate, Instant, NodeId};
 use kit::bench::{block, node, program, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONTROL, DATA, START};
 use kit::boot::Boot;
-use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::model::{until_power_cut, Cut, ModelFlash, ONE_PROGRAM};
+use kit::renewal::LARGE_JOURNAL;
 use kit::rig::released;
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -523,20 +524,9 @@ fn a_store_in_a_region_full_of_what_is_no_record_looks_at_each_slot_a_few_times(
 
 // --- who compacts it
 
-/// The small chip of the model with the regions of a real journal behind it.
-static LARGE: Geometry = Geometry {
-    chip: "large-journal",
-    flash: Region::new(0x0800_0000, 0xC400),
-    sectors: &[
-        SectorRun { count: 4, size: 0x200 },
-        SectorRun { count: 1, size: 0x400 },
-        SectorRun { count: 7, size: 0x800 },
-        SectorRun { count: 2, size: 0x4000 },
-    ],
-    ..CHIP
-};
-const JOURNAL: [Region; 2] = [Region::new(0x0800_4400, 0x4000), Region::new(0x0800_8400, 0x4000)];
-static DEVICE: Layout = Layout { chip: &LARGE, parameters: JOURNAL, ..ONE_PROGRAM }.checked();
+/// The regions of a real journal.
+const JOURNAL: [Region; 2] = LARGE_JOURNAL.parameters;
+static DEVICE: Layout = Layout { chip: LARGE_JOURNAL.chip, parameters: JOURNAL, ..ONE_PROGRAM }.checked();
 static DEVICE_CONFIG: Config = Config { layout: &DEVICE, ..CONFIG };
 
 /// The bootloader after the program has called it back, at a time in ms after its start.
@@ -555,7 +545,7 @@ fn erases(flash: &mut ModelFlash) -> [usize; 2] {
 
 /// A journal with so many used slots, the last of them two values.
 fn used_slots(used: u32) -> ModelFlash {
-    let mut flash = ModelFlash::new(&LARGE);
+    let mut flash = ModelFlash::new(DEVICE.chip);
     let mut journal = Journal::open(&flash, JOURNAL);
     for n in 3..used {
         store(&mut flash, &mut journal, Key::CRASH_COUNT, [n, 0, 0, 0]).unwrap();
@@ -574,7 +564,7 @@ fn used_slots(used: u32) -> ModelFlash {
 fn after_two_updates_a_day_for_ten_years_a_start_takes_as_long_as_at_first() {
     const KEYS: [Key; 5] = [Key::CRASH_COUNT, Key::NODE, Key::program(1), Key::program(255), Key::date(1)];
     for (rests, most_words, most_erases) in [(true, 100, 2_500), (false, 300, 500)] {
-        let mut flash = ModelFlash::new(&LARGE);
+        let mut flash = ModelFlash::new(DEVICE.chip);
         let (mut most, mut erased) = (0, [0; 2]);
         for n in 0..7_300 {
             let mut bench = called_back(&mut flash, if rests { 1_500 } else { 0 });

@@ -6,16 +6,12 @@ use boot_core::store::{Journal, ProgramRecord};
 use canopen::AbortCode;
 use kit::bench::CLEAR;
 use kit::rig::{
-    block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
+    block, hex, image, words, Rig, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
 
 /// Program 1 of the model: sector 4 with 400h bytes, then 5 to 11 with 800h each.
 const FIRST: u8 = 4;
 const LAST: u8 = 11;
-
-fn raw(setup: &'static Setup, len: usize, seed: u8) -> Vec<u8> {
-    program(setup.region(1), PRODUCT_CODE, len, seed)
-}
 
 /// 1F57h of a protected sector: 0Eh, and the sector in the upper half.
 fn secured(sector: u8) -> u32 {
@@ -32,7 +28,7 @@ fn assert_stays(rig: &mut Rig, image: &[u8], what: &str) {
 #[test]
 fn a_protected_sector_costs_nothing() {
     for setup in [&STANDARD_1, &PAULUS_1, &ESACADEMY_1, &LIFT_1] {
-        let (old, new) = (raw(setup, 900, 1), raw(setup, 5000, 2));
+        let (old, new) = (image(setup, 1, 900, 1), image(setup, 1, 5000, 2));
         let base = setup.region(1).base;
         for (form, data) in [("raw", new.clone()), ("HEX", hex(base, &new))] {
             for sector in [FIRST, 5, 6] {
@@ -56,7 +52,7 @@ fn a_protected_sector_costs_nothing() {
 /// Where the size of a program is known before its data are written, sectors after it do not matter.
 #[test]
 fn only_the_sectors_of_the_program_count_where_its_size_is_known() {
-    let (old, new) = (raw(&STANDARD_1, 900, 1), raw(&STANDARD_1, 3000, 2));
+    let (old, new) = (image(&STANDARD_1, 1, 900, 1), image(&STANDARD_1, 1, 3000, 2));
     let base = STANDARD_1.region(1).base;
     // 3000 bytes end in sector 5: 400h and 7B8h.
     for (data, sector, takes) in [
@@ -81,7 +77,7 @@ fn only_the_sectors_of_the_program_count_where_its_size_is_known() {
 /// Otherwise all of the region counts: HEX does not tell its size.
 #[test]
 fn all_sectors_count_where_the_size_is_not_known() {
-    let (old, new) = (raw(&STANDARD_1, 900, 1), raw(&STANDARD_1, 3000, 2));
+    let (old, new) = (image(&STANDARD_1, 1, 900, 1), image(&STANDARD_1, 1, 3000, 2));
     let mut rig = Rig::new(&STANDARD_1, 8192);
     rig.install(1, &old);
     rig.chip.model().protected = vec![LAST];
@@ -95,9 +91,9 @@ fn all_sectors_count_where_the_size_is_not_known() {
 /// A block file names its size in block 0; the first block with data is refused, and no other follows.
 #[test]
 fn blocks_are_refused_before_the_record_is_removed() {
-    let (old, new) = (raw(&STANDARD_1, 900, 1), raw(&STANDARD_1, 3000, 2));
+    let (old, new) = (image(&STANDARD_1, 1, 900, 1), image(&STANDARD_1, 1, 3000, 2));
     let base = STANDARD_1.region(1).base;
-    let control = block(0, 0, &[3000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat());
+    let control = block(0, 0, &words(&[3000, 0, PRODUCT_CODE]));
     for (sector, takes) in [(FIRST, false), (5, false), (6, true)] {
         let mut rig = Rig::new(&STANDARD_1, 8192);
         rig.install(1, &old);
@@ -124,9 +120,9 @@ fn blocks_are_refused_before_the_record_is_removed() {
 /// it, and so does a word in one that was erased before.
 #[test]
 fn a_sector_that_is_protected_in_mid_download_is_named() {
-    let new = raw(&STANDARD_1, 5000, 2);
+    let new = image(&STANDARD_1, 1, 5000, 2);
     let base = STANDARD_1.region(1).base;
-    let control = block(0, 0, &[5000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat());
+    let control = block(0, 0, &words(&[5000, 0, PRODUCT_CODE]));
     // Block 1 ends in sector 5, which is erased for it. Block 2 ends there as well, block 3 in sector 6.
     for (sector, sent) in [(5, 1), (6, 2)] {
         let mut rig = Rig::new(&STANDARD_1, 8192);
@@ -151,7 +147,7 @@ fn a_sector_that_is_protected_in_mid_download_is_named() {
 #[test]
 fn a_clear_that_erases_loses_nothing_either() {
     for (setup, times) in [(&STANDARD_1, 2), (&AT_ONCE_2, 1)] {
-        let old = raw(setup, 900, 1);
+        let old = image(setup, 1, 900, 1);
         let last = if times == 2 { LAST } else { 7 };
         for sector in [FIRST, last] {
             let mut rig = Rig::new(setup, 8192);
@@ -169,7 +165,7 @@ fn a_clear_that_erases_loses_nothing_either() {
 /// A CLEAR in the middle of a download that is acknowledged erases, where the product erases at once.
 #[test]
 fn a_clear_at_once_erases_in_the_middle_of_a_download() {
-    let image = raw(&AT_ONCE_2, 3000, 1);
+    let image = image(&AT_ONCE_2, 1, 3000, 1);
     for steps in [0, 1, 2, 5, 20, 100, 1000] {
         let mut rig = Rig::new(&AT_ONCE_2, 8192);
         rig.clear(1);

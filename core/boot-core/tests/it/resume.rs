@@ -432,7 +432,7 @@ fn the_last_block_may_come_again_and_is_written_once() {
             let mut other = block.clone();
             other[20] ^= 1;
             let len = other.len();
-            let crc = kit::bench::block_crc(&other[..len - 4]);
+            let crc = kit::bench::crc32(&other[..len - 4]);
             other[len - 4..].copy_from_slice(&crc.to_le_bytes());
             assert_eq!(bench.transfer(&other), Err(AbortCode::DEVICE_STATE), "block {number}");
         }

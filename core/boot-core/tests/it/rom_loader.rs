@@ -5,7 +5,7 @@ use canopen::od::{Address, Objects};
 use canopen::AbortCode;
 use kit::bench::Bench;
 use kit::model::{ModelFlash, CHIP};
-use kit::rig::{block, program, Rig, ESACADEMY_1, LIFT_1, PRODUCT_CODE, STANDARD_1};
+use kit::rig::{block, raw, words, Rig, ESACADEMY_1, LIFT_1, PRODUCT_CODE, STANDARD_1};
 use shared_abi::warm_start::BootRequest;
 
 const ROM_LOADER: Address = Address::new(0x2008, 0);
@@ -69,9 +69,9 @@ fn the_loader_is_not_started_where_it_cannot_run_or_while_the_flash_works() {
         assert_eq!(rig.node.write(ROM_LOADER, b"roml").is_ok(), starts, "{option_bytes:08X}h");
         assert_eq!(rig.node.take_boot_request().is_some(), starts);
     }
-    let image = program(STANDARD_1.region(1), PRODUCT_CODE, 600, 1);
+    let image = raw(&STANDARD_1, 1, 600);
     rig.command(1, 3).unwrap();
-    rig.send(1, &block(0, 0, &[600_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat())).unwrap();
+    rig.send(1, &block(0, 0, &words(&[600, 0, PRODUCT_CODE]))).unwrap();
     rig.settle();
     rig.send(1, &block(1, STANDARD_1.region(1).base, &image)).unwrap();
     assert_eq!(rig.node.write(ROM_LOADER, b"roml"), STATE);

@@ -41,7 +41,7 @@ fn a_raw_image_is_stored_is_valid_and_starts() {
         let mut bench = Bench::cleared(&mut flash);
         assert_eq!(bench.read_state(), 3, "there is no program");
         assert_eq!(bench.stream(&image, size, pieces), (Ok(()), 0));
-        assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
+        assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
         assert_eq!(bench.read_state(), 0, "stopped");
         assert_eq!(bench.command(START), 0);
         assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)));
@@ -61,7 +61,7 @@ fn hex_is_stored_whatever_its_records_and_line_ends_are() {
         assert_eq!(bench.command(CLEAR), 0);
         let text = hex(&image, len, end);
         assert_eq!(bench.stream(text.as_bytes(), None, pieces), (Ok(()), 0), "{len} {end:?}");
-        assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
+        assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
         assert_eq!(&flash.cells(PROGRAM)[..1000], image);
         assert_eq!(autostart(&flash), Ok(0x22));
     }
@@ -93,7 +93,7 @@ fn hex_may_have_gaps_and_any_order() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::cleared(&mut flash);
     assert_eq!(bench.stream(text.as_bytes(), Some(text.len() as u32), 7), (Ok(()), 0));
-    assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
+    assert_eq!(bench.word(IDENTIFICATION), crc32(&image));
     assert_eq!(autostart(&flash), Ok(0x33));
 }
 
@@ -103,8 +103,7 @@ fn hex_may_have_gaps_and_any_order() {
 #[test]
 fn a_program_is_fresh_only_right_behind_a_stream() {
     let image = program(500, 0x45);
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::cleared(&mut flash);
+    let mut bench = Bench::cleared(new_flash());
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     assert_eq!(bench.command(START), 0);
@@ -365,7 +364,7 @@ fn stop_counts_as_clear_for_one_download_in_one_transfer() {
     }
     let mut bench = Bench::new(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), NOT_CLEARED);
-    assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (0, block_crc(&image)));
+    assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (0, crc32(&image)));
     // A program that has answered STOP itself leaves it without a node-ID.
     for (owed, is_taken) in [((1, 0, 0), true), ((1, 3, 0), false), ((2, 0, 0), false), ((0, 0, 0), false)] {
         let (program, value, node_id) = owed;
@@ -430,13 +429,12 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     const ENABLE: Address = Address::new(0x7F50, 1);
     static ENTRIES: [Entry; entry_count(1, Profile::ESACADEMY.extras)] =
         entries(1, Profile::ESACADEMY.extras).entries();
-    let policy = Profile::ESACADEMY.download;
+    fn of_esacademy(flash: &mut ModelFlash) -> Bench<'_> {
+        let Profile { download, password, .. } = Profile::ESACADEMY;
+        Bench::with_config(flash, Config { entries: &ENTRIES, download, password, ..CONFIG }, 1024)
+    }
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with_config(
-        &mut flash,
-        Config { entries: &ENTRIES, download: policy, password: Profile::ESACADEMY.password, ..CONFIG },
-        1024,
-    );
+    let mut bench = of_esacademy(&mut flash);
     let image = program(600, 0x12);
     for command in [CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
         assert_eq!(bench.node.write(CONTROL, &[command]), Err(STATE));
@@ -457,11 +455,7 @@ fn a_password_opens_1f50_and_a_wrong_one_is_slowed_down() {
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Fresh(1)), "by itself");
     // The next password makes it invalid at once.
-    let mut bench = Bench::with_config(
-        &mut flash,
-        Config { entries: &ENTRIES, download: policy, password: Profile::ESACADEMY.password, ..CONFIG },
-        1024,
-    );
+    let mut bench = of_esacademy(&mut flash);
     assert_eq!(bench.read_state(), 0);
     bench.node.write(ENABLE, b"TINI").unwrap();
     bench.settle();

@@ -7,17 +7,13 @@ use canopen::{AbortCode, NodeId};
 use kit::bench::{new_flash, Bench, SET_SIGNATURE};
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
-    block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
+    block, hex, image, words, Rig, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
 use std::task::Poll;
 
 /// 1F57h: NO_ACCESS ("programming is not allowed at present", L-1112d_10 table 3); in the upper half, 1 for the
 /// supply (docs/protocol.md).
 const LOW_SUPPLY: u32 = 0x0001_0084;
-
-fn raw(setup: &'static Setup, len: usize, seed: u8) -> Vec<u8> {
-    program(setup.region(1), PRODUCT_CODE, len, seed)
-}
 
 fn set_low(rig: &Rig, is_low: bool) {
     rig.chip.model().low_from = is_low.then_some(0);
@@ -27,7 +23,7 @@ fn set_low(rig: &Rig, is_low: bool) {
 #[test]
 fn a_supply_that_is_too_low_costs_nothing() {
     for setup in [&STANDARD_1, &PAULUS_1, &ESACADEMY_1, &LIFT_1] {
-        let (old, new) = (raw(setup, 900, 1), raw(setup, 5000, 2));
+        let (old, new) = (image(setup, 1, 900, 1), image(setup, 1, 5000, 2));
         for (form, data) in [("raw", new.clone()), ("HEX", hex(setup.region(1).base, &new))] {
             let what = format!("{}, {form}", setup.name);
             let mut rig = Rig::new(setup, 8192);
@@ -49,14 +45,13 @@ fn a_supply_that_is_too_low_costs_nothing() {
 /// Blocks, and a CLEAR that erases.
 #[test]
 fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
-    let (old, new) = (raw(&STANDARD_1, 900, 1), raw(&STANDARD_1, 3000, 2));
+    let (old, new) = (image(&STANDARD_1, 1, 900, 1), image(&STANDARD_1, 1, 3000, 2));
     let mut rig = Rig::new(&STANDARD_1, 8192);
     rig.install(1, &old);
     set_low(&rig, true);
     rig.clear(1);
     assert_eq!(rig.status(1), 0, "CLEAR alone loses nothing");
-    let control = [3000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat();
-    rig.send_all(1, [&block(0, 0, &control)]);
+    rig.send_all(1, [block(0, 0, &words(&[3000, 0, PRODUCT_CODE]))]);
     let base = STANDARD_1.region(1).base;
     let _ = rig.send(1, &block(1, base, &new[..1000]));
     rig.settle();
@@ -68,7 +63,7 @@ fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
     rig.reset();
     assert_eq!(rig.identification(1), kit::rig::crc32(&old));
 
-    let old = raw(&AT_ONCE_2, 900, 1);
+    let old = image(&AT_ONCE_2, 1, 900, 1);
     let mut rig = Rig::new(&AT_ONCE_2, 8192);
     rig.install(1, &old);
     set_low(&rig, true);
@@ -81,7 +76,7 @@ fn blocks_and_erasing_commands_are_refused_before_the_record_is_removed() {
 /// Nothing of what is stored changes, and the host hears it.
 #[test]
 fn neither_signature_nor_node_id_is_stored() {
-    let image = raw(&STANDARD_1, 900, 1);
+    let image = image(&STANDARD_1, 1, 900, 1);
     let mut rig = Rig::new(&STANDARD_1, 8192);
     rig.install(1, &image);
     rig.work(1, 0x84);
@@ -103,7 +98,7 @@ fn neither_signature_nor_node_id_is_stored() {
 /// good again, the same device takes the program, without a reset and after one.
 #[test]
 fn a_supply_that_falls_in_the_middle_loses_no_device() {
-    let (old, new) = (raw(&STANDARD_1, 900, 1), raw(&STANDARD_1, 3000, 2));
+    let (old, new) = (image(&STANDARD_1, 1, 900, 1), image(&STANDARD_1, 1, 3000, 2));
     let mut ends = Vec::new();
     for from in 1.. {
         let mut rig = Rig::new(&STANDARD_1, 8192);

@@ -4,13 +4,12 @@ use std::sync::{Arc, Mutex};
 
 use super::{Deed, Fake, Maker, APPLICATION, NODE};
 
-/// Abort codes (CiA 301 table 22).
+pub use super::renewal::{NOT_NOW, NOT_STORED, NO_OBJECT};
+
+/// More abort codes (CiA 301 table 22).
 const WRITE_ONLY: u32 = 0x0601_0001;
-pub const NO_OBJECT: u32 = 0x0602_0000;
 const NO_SUB_INDEX: u32 = 0x0609_0011;
 pub const RANGE: u32 = 0x0609_0030;
-pub const NOT_NOW: u32 = 0x0800_0022;
-const NOT_STORED: u32 = 0x0800_0020;
 
 /// CiA 814-1 clause 6.3.
 pub const LIFT: u32 = 0xFE00_01A1;
