@@ -188,6 +188,10 @@ pub struct Scenario {
 }
 
 impl Scenario {
+    const fn named(self, name: &'static str, about: &'static str) -> Self {
+        Self { name, about, ..self }
+    }
+
     /// The same on another device, with so many values more in its journal.
     #[must_use]
     pub const fn on(self, setup: &'static Setup, stores: u32) -> Self {
@@ -302,15 +306,26 @@ const UPDATE: Scenario = Scenario {
     end: End(Some(NEW), None, true, &[]),
 };
 
+const DURING: Scenario = Scenario {
+    setup: &ESACADEMY_2,
+    before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
+    act: password_during,
+    recover: Some(|setup| both(setup, [NEW_LABELLED, NEW_2])),
+    one_in: 8,
+    end: End(Some(NEW_LABELLED), Some(NEW_2), true, &[]),
+    ..UPDATE.named(
+        "password-during",
+        "ESAcademy's passwords of two programs, one in the middle of work on the other one",
+    )
+};
+
 const SEALED: Scenario = Scenario {
-    name: "sealed",
-    about: "a sealed program with a higher security counter",
     setup: &with_keys::STANDARD_1,
     before: |setup| sealed(setup, 2),
     act: |setup| sealed(setup, 5),
     one_in: 200,
     end: End(release(5), None, true, &[]),
-    ..UPDATE
+    ..UPDATE.named("sealed", "a sealed program with a higher security counter")
 };
 
 const CONFIRMED: Scenario = Scenario {
@@ -322,184 +337,131 @@ const CONFIRMED: Scenario = Scenario {
 
 /// All of them.
 pub static SCENARIOS: &[Scenario] = &[
-    Scenario { name: "first-install", about: "a program into an empty device", before: |_| vec![], ..UPDATE },
+    Scenario { before: |_| vec![], ..UPDATE.named("first-install", "a program into an empty device") },
     UPDATE,
     Scenario {
-        name: "raw",
-        about: "another program as a raw image, which is valid without a signature command",
         act: |setup| at_once(setup, 1, NEW, Part::Whole),
-        ..UPDATE
+        ..UPDATE.named("raw", "another program as a raw image, which is valid without a signature command")
     },
     Scenario {
-        name: "hex",
-        about: "another program as Intel HEX",
         act: |setup| at_once(setup, 1, NEW, Part::Hex),
-        ..UPDATE
+        ..UPDATE.named("hex", "another program as Intel HEX")
     },
     Scenario {
-        name: "wrong-crc",
-        about: "an update whose last block tells another CRC, then the right one",
         act: |setup| {
             let last = file(setup, NEW).blocks.len() - 1;
             let wrong = [flawed(setup, last, Flaw::Sum), command(1, SET_SIGNATURE).to_vec()];
             [wrong.concat(), install(setup, 1, NEW)].concat()
         },
         recover: Some(|setup| install(setup, 1, NEW)),
-        ..UPDATE
+        ..UPDATE.named("wrong-crc", "an update whose last block tells another CRC, then the right one")
     },
     Scenario {
-        name: "wrong-product",
-        about: "an update for another product, which costs nothing",
         act: |setup| flawed(setup, 0, Flaw::Product),
         recover: Some(|setup| install(setup, 1, NEW)),
-        ..UPDATE
+        ..UPDATE.named("wrong-product", "an update for another product, which costs nothing")
     },
     Scenario {
-        name: "erase",
-        about: "a program taken away by two CLEARs",
         act: |_| [command(1, CLEAR), command(1, CLEAR)].concat(),
         end: End(None, None, false, &[]),
-        ..UPDATE
+        ..UPDATE.named("erase", "a program taken away by two CLEARs")
     },
     Scenario {
-        name: "erase-and-install",
-        about: "a program taken away by two CLEARs, and after a reset another one without CLEAR, which looks whether the flash is blank",
         act: |setup| {
             let erase = [command(1, CLEAR), command(1, CLEAR)].concat();
             [erase, vec![Action::ResetNode], without_clear(setup)].concat()
         },
-        ..UPDATE
+        ..UPDATE.named(
+            "erase-and-install",
+            "a program taken away by two CLEARs, and after a reset another one without CLEAR, which looks \
+             whether the flash is blank",
+        )
     },
     Scenario {
-        name: "sign",
-        about: "a signature set",
         before: |setup| whole(setup, 1, OLD),
         act: |_| command(1, SET_SIGNATURE).to_vec(),
         end: End(Some(OLD), None, true, &[]),
-        ..UPDATE
+        ..UPDATE.named("sign", "a signature set")
     },
     Scenario {
-        name: "unsign",
-        about: "a signature taken away",
         act: |_| command(1, CLR_SIGNATURE).to_vec(),
         end: End(Some(OLD), None, false, &[]),
-        ..UPDATE
+        ..UPDATE.named("unsign", "a signature taken away")
     },
     Scenario {
-        name: "lss-store",
-        about: "node-ID and bit rate stored by layer setting services",
         act: |_| vec![Action::Store(9), Action::Settle],
         end: End(Some(OLD), None, true, &[9]),
-        ..UPDATE
+        ..UPDATE.named("lss-store", "node-ID and bit rate stored by layer setting services")
     },
     Scenario {
-        name: "compaction",
-        about: "so many stores of node-ID and bit rate that the journal changes over twice",
         act: |_| (1..=50).flat_map(|id| [Action::Store(id), Action::Settle]).collect(),
         recover: Some(|_| vec![Action::Store(100), Action::Settle]),
         end: End(Some(OLD), None, true, &[50, 100]),
         ..UPDATE
+            .named("compaction", "so many stores of node-ID and bit rate that the journal changes over twice")
     },
     Scenario {
-        name: "crash-count",
-        about: "crashes are counted, and a reset clears the count",
         act: |_| vec![Action::Crash, Action::Crash, Action::ResetNode],
         recover: Some(|_| vec![Action::Crash, Action::ResetNode]),
         end: End(Some(OLD), None, true, &[]),
-        ..UPDATE
+        ..UPDATE.named("crash-count", "crashes are counted, and a reset clears the count")
     },
     Scenario {
-        name: "parameter-set",
-        about: "another set of parameters in the place of one, in a lift",
         setup: &LIFT_2,
         before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
         act: |setup| at_once(setup, 2, NEW_2, Part::Whole),
         end: End(Some(OLD_LABELLED), Some(NEW_2), true, &[]),
-        ..UPDATE
+        ..UPDATE.named("parameter-set", "another set of parameters in the place of one, in a lift")
     },
     Scenario {
-        name: "second-program",
-        about: "program 2 updated while program 1 stays what it is",
         before: |setup| [install(setup, 1, OLD), install(setup, 2, OLD_2)].concat(),
         act: |setup| install(setup, 2, NEW_2),
         end: End(Some(OLD), Some(NEW_2), true, &[]),
-        ..UPDATE
+        ..UPDATE.named("second-program", "program 2 updated while program 1 stays what it is")
     },
     Scenario {
-        name: "beside-the-second",
-        about: "program 1 updated while program 2 stays what it is",
         before: |setup| [install(setup, 1, OLD), install(setup, 2, OLD_2)].concat(),
         end: End(Some(NEW), Some(OLD_2), true, &[]),
-        ..UPDATE
+        ..UPDATE.named("beside-the-second", "program 1 updated while program 2 stays what it is")
     },
     Scenario {
-        name: "lift-password-during",
-        about: "a lift's password in the middle of work, and then the set of parameters broken off",
         setup: &LIFT_2,
-        before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
-        act: password_during,
-        recover: Some(|setup| both(setup, [NEW_LABELLED, NEW_2])),
-        one_in: 8,
-        end: End(Some(NEW_LABELLED), Some(NEW_2), true, &[]),
-        ..UPDATE
+        ..DURING.named(
+            "lift-password-during",
+            "a lift's password in the middle of work, and then the set of parameters broken off",
+        )
     },
+    DURING,
     Scenario {
-        name: "password-during",
-        about: "ESAcademy's passwords of two programs, one in the middle of work on the other one",
-        setup: &ESACADEMY_2,
-        before: |setup| both(setup, [OLD_LABELLED, OLD_2]),
-        act: password_during,
-        recover: Some(|setup| both(setup, [NEW_LABELLED, NEW_2])),
-        one_in: 8,
-        end: End(Some(NEW_LABELLED), Some(NEW_2), true, &[]),
-        ..UPDATE
-    },
-    Scenario {
-        name: "renewal",
-        about: "the bootloader is renewed; a program is there before and afterwards",
         setup: &RENEWALS[0],
         act: renew,
         one_in: 1000,
         end: End(Some(OLD), None, true, &[]),
-        ..UPDATE
+        ..UPDATE.named("renewal", "the bootloader is renewed; a program is there before and afterwards")
     },
     SEALED,
     Scenario {
-        name: "compressed",
-        about: "the same, encrypted and compressed",
         act: |setup| sealed(setup, 4),
         end: End(release(4), None, true, &[]),
-        ..SEALED
+        ..SEALED.named("compressed", "the same, encrypted and compressed")
     },
+    Scenario { before: |_| vec![], ..SEALED.named("sealed-first", "a sealed program into an empty device") },
     Scenario {
-        name: "sealed-first",
-        about: "a sealed program into an empty device",
-        before: |_| vec![],
-        ..SEALED
-    },
-    Scenario {
-        name: "sealed-again",
-        about: "the same sealed program once more",
         before: |setup| sealed(setup, 5),
-        ..SEALED
+        ..SEALED.named("sealed-again", "the same sealed program once more")
     },
+    CONFIRMED.named("proved", "a sealed program that has proved itself, and another one that has not yet"),
     Scenario {
-        name: "proved",
-        about: "a sealed program that has proved itself, and another one that has not yet",
-        ..CONFIRMED
-    },
-    Scenario {
-        name: "proved-erase",
-        about: "a sealed program that has proved itself, taken away by the holder of a root",
         act: erase_sealed,
         end: End(None, None, false, &[]),
-        ..CONFIRMED
+        ..CONFIRMED.named(
+            "proved-erase",
+            "a sealed program that has proved itself, taken away by the holder of a root",
+        )
     },
     Scenario {
-        name: "proved-again",
-        about: "the same, and the other one proves itself, too",
         act: |setup| proved(setup, 5),
-        ..CONFIRMED
+        ..CONFIRMED.named("proved-again", "the same, and the other one proves itself, too")
     },
 ];
 
@@ -785,7 +747,7 @@ fn kept(history: &History, seen: &Observation) -> Result<(), String> {
 }
 
 /// A panic of the bootloader is an error.
-fn carried_out<T>(act: impl FnOnce() -> T) -> Result<T, String> {
+pub(crate) fn carried_out<T>(act: impl FnOnce() -> T) -> Result<T, String> {
     caught(act).map_err(|cause| {
         let text = cause.downcast_ref::<String>().map(String::as_str);
         text.or(cause.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()

@@ -104,17 +104,7 @@ fn removes(key: Key, value: Value) -> bool {
 /// The record of the new program, released.
 fn new_record() -> Value {
     let new = file(&STANDARD_2, NEW);
-    let record = ProgramRecord {
-        size: new.plain.len() as u32,
-        crc: new.crc,
-        signed: true,
-        confirmed: false,
-        version: 0,
-        half_erased: false,
-        seal: None,
-        withdrawn: false,
-    };
-    record.value()
+    kit::rig::released(new.plain.len() as u32, new.crc).value()
 }
 
 /// The same record, released.

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::fmt;
 
 use canopen::AbortCode;
-use kit::model::caught;
 use shared_abi::renewal::Origin;
 
+use crate::cuts::carried_out;
 use crate::device::{Action, Device, Program, Stored, Trouble};
 use crate::files::{file, Content, Extent, Part, NEWEST};
 use crate::rules::{broken, History};
@@ -52,12 +52,8 @@ impl<D: Device> Attack<'_, D> {
             let actions = script::renewal(&self.history.seen, self.device.setup(), *image);
             return self.act_all(&actions).map(Ok);
         }
-        let (answer, seen) =
-            caught(|| (self.device.act(action), self.device.observe())).map_err(|cause| {
-                let text = cause.downcast_ref::<String>().map(String::as_str);
-                let text = text.or(cause.downcast_ref::<&str>().copied());
-                Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
-            })?;
+        let (answer, seen) = carried_out(|| (self.device.act(action), self.device.observe()))
+            .map_err(|text| Broken("nothing panics, and all work ends", text))?;
         self.met.refused += u64::from(answer.is_err());
         self.history.note(action, answer);
         if let Some(rule) = broken(&self.history, &seen) {

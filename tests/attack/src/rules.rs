@@ -228,31 +228,32 @@ pub struct Rule {
     pub is_kept: fn(before: &History, now: &Observation) -> bool,
 }
 
+const fn rule(name: &'static str, is_kept: fn(&History, &Observation) -> bool) -> Rule {
+    Rule { name, is_kept }
+}
+
 pub const RULES: &[Rule] = &[
-    Rule { name: "a bootloader can be loaded after each reset", is_kept: loads },
-    Rule { name: "the installation alone removes a confirmed record", is_kept: keeps_confirmed },
-    Rule { name: "data are not changed while a record for them is valid", is_kept: records_are_true },
-    Rule { name: "a program is lost by CLEAR or by accepted data alone", is_kept: keeps_programs },
-    Rule { name: "a program has the CRC that is told, and was sent with it", is_kept: tells_the_truth },
-    Rule {
-        name: "the journal and what an action names alone are erased or written",
-        is_kept: touches_the_named,
-    },
-    Rule { name: "records that no action names and what LSS stored stay", is_kept: others_stay },
-    Rule { name: "what starts is what was asked for", is_kept: starts_what_was_asked },
-    Rule { name: "values and aborts are those of the standards", is_kept: has_defined_values },
-    Rule { name: "without work no program is busy", is_kept: ends },
-    Rule { name: "what starts by itself is whole and released", is_kept: starts_the_whole },
-    Rule { name: "a program is released by 83h or by a transfer of all of it", is_kept: releases },
-    Rule { name: "without the password nothing is taken", is_kept: is_locked },
-    Rule { name: "data up to the address in 2006h are in flash", is_kept: goes_on },
-    Rule { name: "a sealed device has sealed programs alone", is_kept: is_sealed },
-    Rule { name: "no security counter decreases", is_kept: counts },
-    Rule { name: "no program is there before its security counter", is_kept: is_counted },
-    Rule { name: "no program follows a proved one with a higher counter", is_kept: follows },
-    Rule { name: "with confirmation a counter waits for it", is_kept: waits },
-    Rule { name: "a sealed bootloader follows one with a lower counter", is_kept: follows_home },
-    Rule { name: "2007h/2 is what a power-on does, and 2007h/12 is what is released", is_kept: says_what_is },
+    rule("a bootloader can be loaded after each reset", loads),
+    rule("the installation alone removes a confirmed record", keeps_confirmed),
+    rule("data are not changed while a record for them is valid", records_are_true),
+    rule("a program is lost by CLEAR or by accepted data alone", keeps_programs),
+    rule("a program has the CRC that is told, and was sent with it", tells_the_truth),
+    rule("the journal and what an action names alone are erased or written", touches_the_named),
+    rule("records that no action names and what LSS stored stay", others_stay),
+    rule("what starts is what was asked for", starts_what_was_asked),
+    rule("values and aborts are those of the standards", has_defined_values),
+    rule("without work no program is busy", ends),
+    rule("what starts by itself is whole and released", starts_the_whole),
+    rule("a program is released by 83h or by a transfer of all of it", releases),
+    rule("without the password nothing is taken", is_locked),
+    rule("data up to the address in 2006h are in flash", goes_on),
+    rule("a sealed device has sealed programs alone", is_sealed),
+    rule("no security counter decreases", counts),
+    rule("no program is there before its security counter", is_counted),
+    rule("no program follows a proved one with a higher counter", follows),
+    rule("with confirmation a counter waits for it", waits),
+    rule("a sealed bootloader follows one with a lower counter", follows_home),
+    rule("2007h/2 is what a power-on does, and 2007h/12 is what is released", says_what_is),
 ];
 
 /// The first rule that is broken.
