@@ -13,7 +13,9 @@
 #![no_std]
 #![no_main]
 
-use bsp::IDENTITY;
+use bsp::{IDENTITY, LAYOUT};
+use coboot_app::warm_start::BootRequest;
+use coboot_app::{Bootloader, ReentryPath};
 use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;
 
@@ -44,6 +46,13 @@ static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", env!("CARGO_P
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     cortex_m::peripheral::SCB::sys_reset()
+}
+
+/// The crystal has failed (RM0090 section 7.2.7), which is no crash of the program. The next start finds whether it
+/// runs again.
+#[cortex_m_rt::exception]
+unsafe fn NonMaskableInt() -> ! {
+    Bootloader::new(LAYOUT).leave(ReentryPath::SystemReset, BootRequest::PowerOn)
 }
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]

@@ -34,6 +34,16 @@ systick_monotonic!(Mono, 1_000);
 /// bootloader stays reachable.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
+    restart()
+}
+
+/// The crystal has failed (RM0090 section 7.2.7). After the reset the bootloader finds whether it starts again.
+#[cortex_m_rt::exception]
+unsafe fn NonMaskableInt() -> ! {
+    restart()
+}
+
+fn restart() -> ! {
     product::warm_start_cell().put(BootRequest::Fault);
     SCB::sys_reset()
 }

@@ -10,6 +10,8 @@ use crate::facts::{CHIP, CLOCK_TREE, INTERNAL, SYSCLK};
 const HSEON: u32 = 1 << 16;
 const HSERDY: u32 = 1 << 17;
 const HSEBYP: u32 = 1 << 18;
+/// The clock security system.
+const CSSON: u32 = 1 << 19;
 const PLLON: u32 = 1 << 24;
 const PLLRDY: u32 = 1 << 25;
 /// RCC_PLLCFGR: the PLL's input is the crystal.
@@ -74,14 +76,19 @@ impl Source {
     }
 }
 
-/// Switches the crystal on. Returns whether it runs before it is given up.
+/// Switches the crystal on. Returns whether it runs before it is given up. One that fails later is an NMI, with the
+/// core on HSI (section 7.2.7); without that a PLL would go on at a few MHz, with wrong bit times on the bus.
 pub(crate) fn start_crystal(rcc: &pac::RCC) -> bool {
     // The bypass can be selected only while the oscillator is off (section 7.3.1).
     if CLOCK_TREE.hse_bypass {
         set(rcc, HSEBYP);
     }
     set(rcc, HSEON);
-    reaches(rcc.cr().as_ptr(), HSERDY, HSERDY)
+    let runs = reaches(rcc.cr().as_ptr(), HSERDY, HSERDY);
+    if runs {
+        set(rcc, CSSON);
+    }
+    runs
 }
 
 /// Restores the clocks of the reset state.

@@ -10,7 +10,7 @@ use crate::bus::node::Pins;
 use crate::bxcan::{self, BxCan};
 use crate::clock::CycleClock;
 use crate::cortex::debug::Debug;
-use crate::cortex::exceptions::SYS_TICK;
+use crate::cortex::exceptions::{NMI, SYS_TICK};
 use crate::cortex::scs::Scs;
 use crate::memory::{HostMemory, PAGE};
 use crate::options::Options;
@@ -321,7 +321,7 @@ impl Chip {
     /// The crystal of the board has this frequency from now on, 0 when it stops.
     pub fn set_crystal(&mut self, hz: u32) {
         self.hse_hz = hz;
-        self.rcc.set_crystal(hz);
+        self.rcc.set_crystal(hz, self.now());
         self.slice.leave = true;
     }
 
@@ -593,6 +593,9 @@ impl Chip {
         }
         if self.scs.systick.advance(now) {
             self.scs.exceptions.pend(SYS_TICK);
+        }
+        if self.rcc.has_failed() {
+            self.scs.exceptions.pend(NMI);
         }
         self.update_lines();
     }

@@ -652,8 +652,7 @@ impl Machine {
         self.cpu.chip_mut().flash.options.preset_hardware_watchdog(on);
     }
 
-    /// The crystal of the board stops (0), or has this frequency again, in Hz. A core that runs from a
-    /// crystal that stops stands still until a watchdog resets it.
+    /// The crystal of the board stops (0), or has this frequency again, in Hz (`Rcc::set_crystal`).
     pub fn set_crystal(&mut self, hz: u32) {
         self.cpu.chip_mut().set_crystal(hz);
     }

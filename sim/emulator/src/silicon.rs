@@ -29,6 +29,9 @@ pub struct Silicon {
     /// The time from HSEON to HSERDY with a crystal, in µs: some milliseconds, by the crystal (datasheet, HSE
     /// oscillator characteristics: 2 ms typical).
     pub crystal_start_us: u32,
+    /// What the oscillator of a PLL does without an input, in Hz. No document says more than "not locked"; an
+    /// STM32F407 was seen to go on at 8 MHz in place of 168, which is twice that.
+    pub pll_free_hz: u32,
     /// How long after a request on the bus INAK and SLAK come at the earliest, in µs (RM0090 section 32.4
     /// has no time).
     pub can_mode_us: u32,
@@ -54,6 +57,7 @@ pub const TYPICAL: Silicon = Silicon {
     systick_value: 0,
     flags_after_standby: false,
     crystal_start_us: 2_000,
+    pll_free_hz: 16_000_000,
     can_mode_us: 0,
     can_sleeps_deeply: false,
     can_sticks: false,
@@ -70,6 +74,7 @@ pub const WORST: Silicon = Silicon {
     systick_value: *SYSTICK.end(),
     flags_after_standby: false,
     crystal_start_us: *CRYSTAL_START.end(),
+    pll_free_hz: *PLL_FREE.start(),
     can_mode_us: *CAN_MODE.end(),
     can_sleeps_deeply: true,
     can_sticks: true,
@@ -82,6 +87,7 @@ const HSI: RangeInclusive<u32> = 15_360_000..=16_640_000;
 const UPDATE: RangeInclusive<u32> = 1..=5;
 const SYSTICK: RangeInclusive<u32> = 0..=0x00FF_FFFF;
 const CRYSTAL_START: RangeInclusive<u32> = 300..=20_000;
+const PLL_FREE: RangeInclusive<u32> = 4_000_000..=64_000_000;
 const CAN_MODE: RangeInclusive<u32> = 0..=30;
 const FLASH_SLOWNESS: RangeInclusive<u32> = 0..=1_000;
 
@@ -109,6 +115,7 @@ impl Silicon {
             can_sticks: draw(0..=1) == 1,
             flash_slowness_permille: draw(FLASH_SLOWNESS),
             stale_lines: draw(0..=1) == 1,
+            pll_free_hz: draw(PLL_FREE),
         }
     }
 }
@@ -122,13 +129,14 @@ impl Default for Silicon {
 impl fmt::Display for Silicon {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
-        let Self { crystal_start_us, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
+        let Self { crystal_start_us, pll_free_hz, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
             f,
             "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
+             PLL without an input: {pll_free_hz} Hz, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
              on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}"
         )

@@ -12,6 +12,9 @@ const LSE_START: Span = Span::from_millis(2_000);
 /// The maximum at the upper end of the VCO range.
 const PLL_LOCK: Span = Span::from_micros(200);
 
+/// CFGR: the source of the system clock that software wants.
+const CFGR_SW: u32 = 0b11;
+
 const CR_HSION: u32 = 1 << 0;
 const CR_HSIRDY: u32 = 1 << 1;
 const CR_HSEON: u32 = 1 << 16;
@@ -25,6 +28,10 @@ const CR_PLLI2SRDY: u32 = 1 << 27;
 const CR_PLLSAION: u32 = 1 << 28;
 const CR_TRIM: u32 = 0x1F << 3;
 const CR_RESET: u32 = 0x0000_0083;
+
+/// CIR: the clock security system has seen the crystal fail, and the bit that takes this away.
+const CIR_CSSF: u32 = 1 << 7;
+const CIR_CSSC: u32 = 1 << 23;
 
 const CSR_LSION: u32 = 1 << 0;
 const CSR_LSIRDY: u32 = 1 << 1;
@@ -129,8 +136,10 @@ pub const APB2ENR: u32 = 0x44;
 /// The clock tree and the reset flags.
 #[derive(Clone, Debug)]
 pub struct Rcc {
-    /// Frequency of the crystal or clock at OSC_IN; 0 where there is none.
+    /// Frequency of the crystal or clock at OSC_IN; 0 where there is none, or it has stopped.
     hse_hz: u32,
+    /// Whether the clock security system has seen the crystal fail: CIR.CSSF.
+    has_failed: bool,
     variant: &'static Variant,
     silicon: Silicon,
     /// The variant's plain registers.
@@ -156,6 +165,7 @@ impl Rcc {
     pub fn new(variant: &'static Variant, hse_hz: u32, silicon: Silicon) -> Self {
         Self {
             hse_hz,
+            has_failed: false,
             variant,
             silicon,
             plain: variant.rcc().collect(),
@@ -191,20 +201,50 @@ impl Rcc {
         };
     }
 
-    /// The crystal works, or has stopped. Without the clock security system nothing takes its place: what
-    /// runs from it stands still (section 7.2.7).
-    pub fn set_crystal(&mut self, hz: u32) {
+    /// The crystal has this frequency from now on; 0 when it stops. The clock security system puts the HSI in its
+    /// place, and switches off what ran from it (section 7.2.7). Without it a PLL goes on at its lowest frequency.
+    pub fn set_crystal(&mut self, hz: u32, now: Time) {
+        let fails = hz == 0 && self.hse_is_ready(now) && self.cr_rest & CR_CSSON != 0;
         self.hse_hz = hz;
-        if hz == 0 {
-            self.hse = Source::Off;
+        if !fails {
+            return;
+        }
+        self.has_failed = true;
+        self.hse = Source::Off;
+        if self.hse_feeds_sysclk() {
+            if self.sws == 2 {
+                (self.pll, self.plli2s) = (Source::Off, Source::Off);
+            }
+            self.hsi.switch(true, Span(0), now);
+            self.cfgr &= !CFGR_SW;
+            self.sws = 0;
         }
     }
 
-    /// Whether the system clock comes from a crystal that has stopped.
+    /// Whether the clock security system has seen the crystal fail. It asks for the NMI until software has
+    /// cleared its flag (section 7.2.7).
+    #[must_use]
+    pub fn has_failed(&self) -> bool {
+        self.has_failed
+    }
+
+    fn hse_is_ready(&self, now: Time) -> bool {
+        self.hse_hz > 0 && self.hse.is_ready(now)
+    }
+
+    fn pll_from_hse(&self) -> bool {
+        self.plain(PLLCFGR) & 1 << 22 != 0
+    }
+
+    /// Whether the system clock comes from the crystal, or from a PLL that does.
+    fn hse_feeds_sysclk(&self) -> bool {
+        self.sws == 1 || self.sws == 2 && self.pll_from_hse()
+    }
+
+    /// Whether the system clock is that of a crystal that has stopped, without a PLL.
     #[must_use]
     pub fn is_stopped(&self) -> bool {
-        let pll_from_hse = self.plain(PLLCFGR) & 1 << 22 != 0;
-        self.hse_hz == 0 && (self.sws == 1 || self.sws == 2 && pll_from_hse)
+        self.hse_hz == 0 && self.sws == 1
     }
 
     /// Whether the LSI is on.
@@ -230,10 +270,13 @@ impl Rcc {
 
     fn pll_hz(&self) -> u32 {
         let cfgr = self.plain(PLLCFGR);
-        let input = if cfgr & 1 << 22 != 0 { self.hse_hz } else { self.silicon.hsi_hz };
+        let input = if self.pll_from_hse() { self.hse_hz } else { self.silicon.hsi_hz };
         let (m, n) = (cfgr & 0x3F, cfgr >> 6 & 0x1FF);
         let p = 2 * ((cfgr >> 16 & 3) + 1);
-        let vco = u64::from(input) * u64::from(n) / u64::from(m.max(1));
+        let vco = match input {
+            0 => self.silicon.pll_free_hz.into(),
+            _ => u64::from(input) * u64::from(n) / u64::from(m.max(1)),
+        };
         let vco = vco.saturating_sub(vco * self.down_spread() / (2 * u64::from(n.max(1)) * 0x7FFF));
         u32::try_from(vco / u64::from(p)).unwrap_or(u32::MAX)
     }
@@ -285,7 +328,7 @@ impl Rcc {
         let wanted = self.cfgr & 3;
         let ready = match wanted {
             0 => self.hsi.is_ready(now),
-            1 => self.hse.is_ready(now),
+            1 => self.hse_is_ready(now),
             2 => self.pll.is_ready(now),
             _ => false,
         };
@@ -298,35 +341,28 @@ impl Rcc {
         let bits = |source: Source, on, ready| {
             (if source.is_on() { on } else { 0 }) | (if source.is_ready(now) { ready } else { 0 })
         };
+        let hse_ready = if self.hse_hz > 0 { CR_HSERDY } else { 0 };
         self.cr_rest
             | bits(self.hsi, CR_HSION, CR_HSIRDY)
-            | bits(self.hse, CR_HSEON, CR_HSERDY)
+            | bits(self.hse, CR_HSEON, hse_ready)
             | bits(self.pll, CR_PLLON, CR_PLLRDY)
             | bits(self.plli2s, CR_PLLI2SON, CR_PLLI2SRDY)
     }
 
     fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
         self.cr_rest = value & (CR_TRIM | CR_HSEBYP | CR_CSSON);
-        let pll_from_hse = self.plain(PLLCFGR) & 1 << 22 != 0;
-        let uses = |source| self.sws == source;
         // What feeds the system clock cannot be switched off (section 7.3.1).
-        let hse_fed = uses(1) || uses(2) && pll_from_hse;
-        let hsi_fed = uses(0) || uses(2) && !pll_from_hse;
-        let pll_fed = uses(2);
+        let (hse_fed, pll_fed) = (self.hse_feeds_sysclk(), self.sws == 2);
+        let hsi_fed = !hse_fed;
         self.hsi.switch(value & CR_HSION != 0 || hsi_fed, HSI_START, now);
-        if self.hse_hz > 0 {
-            let start = Span::from_micros(self.silicon.crystal_start_us.into());
-            self.hse.switch(value & CR_HSEON != 0 || hse_fed, start, now);
-        }
+        let start = Span::from_micros(self.silicon.crystal_start_us.into());
+        self.hse.switch(value & CR_HSEON != 0 || hse_fed, start, now);
         self.pll.switch(value & CR_PLLON != 0 || pll_fed, PLL_LOCK, now);
         self.plli2s.switch(value & CR_PLLI2SON != 0, PLL_LOCK, now);
         if self.hse_hz == 0 && value & CR_HSEON != 0 {
             return Err(Unmodelled(
                 "HSEON is set, but this board has no crystal: HSERDY will never come".into(),
             ));
-        }
-        if value & CR_CSSON != 0 {
-            return Err(Unmodelled("the clock security system is not modelled".into()));
         }
         if value & CR_PLLSAION != 0 {
             return Err(Unmodelled("the PLL for SAI and display is not modelled".into()));
@@ -355,7 +391,8 @@ impl Peripheral for Rcc {
                     | (if self.lsi.is_on() { CSR_LSION } else { 0 })
                     | (if self.lsi.is_ready(now) { CSR_LSIRDY } else { 0 })
             }
-            // CIR: see `write`.
+            // CIR; the interrupts of ready clocks: see `write`.
+            0x0C if self.has_failed => CIR_CSSF,
             0x0C => 0,
             _ => match self.plain.iter().find(|register| register.at == offset) {
                 Some(register) => register.value,
@@ -385,7 +422,7 @@ impl Peripheral for Rcc {
             0x0C if value & 0xFF_FF00 & !0x9F_0000 != 0 => {
                 return Err(Unmodelled("the clock interrupts are not modelled".into()));
             }
-            0x0C => {}
+            0x0C => self.has_failed &= value & CIR_CSSC == 0,
             0x70 => {
                 self.lse.switch(value & BDCR_LSEON != 0, LSE_START, now);
                 self.bdcr_rest = value & 0x0001_8304;

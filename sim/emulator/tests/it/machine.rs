@@ -2,6 +2,7 @@
 //! results come from the architecture and the reference manuals.
 
 mod can_pins;
+mod crystal;
 mod debug;
 mod flash;
 mod option_bytes;
@@ -892,28 +893,4 @@ fn the_window_watchdog_resets_the_chip() {
     assert!((17_384..17_390).contains(&at), "{at} us");
     assert_eq!(machine.register(0x4002_3874).unwrap() >> 24, 0x4E);
     assert_eq!(machine.run_until(ms(100)), Stop::Deadline, "the reset stops it");
-}
-
-/// RM0090 section 7.2: nothing takes the place of a crystal that stops, and the core stands still until the
-/// independent watchdog, which has the LSI, resets it: 4 x 1001 periods of 32 kHz.
-#[test]
-fn a_core_whose_crystal_stops_stands_still_until_the_watchdog_bites() {
-    let mut machine = machine(&programs::BUSY);
-    machine.run_until(ms(1));
-    machine.poke(0x4002_3800, &0x0001_0083_u32.to_le_bytes()).unwrap();
-    machine.run_until(ms(10));
-    machine.poke(0x4002_3808, &1_u32.to_le_bytes()).unwrap();
-    machine.run_until(ms(11));
-    assert_eq!(machine.core_clock(), 8_000_000);
-    machine.preset_watchdog(1_000);
-    machine.set_crystal(0);
-    let before = machine.counters().instructions;
-    assert_eq!(machine.run_until(ms(111)), Stop::Deadline);
-    assert!(machine.counters().instructions - before < 10);
-    assert_eq!(machine.run_until(ms(500)), Stop::Reset(ResetCause::IndependentWatchdog));
-    let at = machine.now().0 / 1_000_000;
-    assert!((136_120..136_130).contains(&at), "{at} us");
-    machine.run_until(ms(200));
-    assert_eq!(machine.core_clock(), 16_000_000);
-    assert!(machine.counters().instructions > before + 1_000);
 }
