@@ -43,8 +43,8 @@ static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", env!("CARGO_P
 
 /// A fault, or a panic (which ends in a fault), restarts the device. The bootloader decides which
 /// program runs then.
-#[cortex_m_rt::exception]
-unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
+#[cortex_m_rt::exception(trampoline = false)]
+unsafe fn HardFault() -> ! {
     cortex_m::peripheral::SCB::sys_reset()
 }
 

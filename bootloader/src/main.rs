@@ -32,8 +32,8 @@ systick_monotonic!(Mono, 1_000);
 
 /// A fault must not leave the device silent; a panic ends in a fault, too. The chip resets, and the
 /// bootloader stays reachable.
-#[cortex_m_rt::exception]
-unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
+#[cortex_m_rt::exception(trampoline = false)]
+unsafe fn HardFault() -> ! {
     restart()
 }
 

@@ -36,6 +36,8 @@ static void start_clock(void)
     RCC_CR |= HSE_BYPASS ? RCC_CR_HSEBYP : 0;
     RCC_CR |= RCC_CR_HSEON;
     reset_unless(&RCC_CR, RCC_CR_HSERDY, RCC_CR_HSERDY);
+    /* One that fails later is an NMI: `crystal_failed` in startup.c. */
+    RCC_CR |= RCC_CR_CSSON;
     RCC_CFGR = RCC_CFGR_SW_HSE;
     reset_unless(&RCC_CFGR, RCC_CFGR_SWS, RCC_CFGR_SWS_HSE);
 }

@@ -14,6 +14,7 @@
 #define RCC_CR_HSEON (UINT32_C(1) << 16)
 #define RCC_CR_HSERDY (UINT32_C(1) << 17)
 #define RCC_CR_HSEBYP (UINT32_C(1) << 18)
+#define RCC_CR_CSSON (UINT32_C(1) << 19)
 #define RCC_CFGR REGISTER(0x40023808)
 #define RCC_CFGR_SW_HSE UINT32_C(1)
 #define RCC_CFGR_SWS (UINT32_C(3) << 2)

@@ -1,4 +1,5 @@
 /* The start of this program, from the bootloader's jump to `main`, and the vectors. */
+#include "coboot/coboot.h"
 #include "registers.h"
 
 extern uint32_t _stack_start, __data_start, __data_end, __bss_start, __bss_end;
@@ -19,6 +20,14 @@ static void unexpected(void)
     }
 }
 
+/* The NMI: the clock security system has put HSI in the place of the crystal (RM0090 section 7.2.7). It is no crash of
+ * the program, and the next start finds whether the crystal runs again.
+ */
+static void crystal_failed(void)
+{
+    coboot_reset(COBOOT_REQUEST_POWER_ON, 0);
+}
+
 /* The vectors of the core, and the interrupt lines of the chip, whose number comes from the build.
  * The label follows the vectors, so more vectors do not fit; the linker script compares the number
  * with the chip's.
@@ -30,7 +39,8 @@ typedef void (*vector)(void);
 __attribute__((section(".vector_table"), used)) static const vector vectors[VECTORS] = {
     [0] = (vector)(uintptr_t)&_stack_start,
     [1] = reset,
-    [2 ... 14] = unexpected,
+    [2] = crystal_failed,
+    [3 ... 14] = unexpected,
     [15] = tick,
     [EXCEPTIONS ... VECTORS - 1] = unexpected,
 };
