@@ -1,8 +1,14 @@
 //! A board whose crystal has failed: the bootloader runs from the internal oscillator, whose error CAN
 //! does not tolerate (2007h/5, and the choice `crystal_failure` of the product).
 
+use std::time::Duration;
+
+use canopen::NodeId;
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{dead_crystal, firmware};
+use coflash_core::device::{Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::{Span, Time};
@@ -139,11 +145,76 @@ fn a_crystal_that_flickers_costs_a_program_a_restart_and_not_its_release() {
         }
         assert!(!bench.is_bootloader(NODE));
     }
-    let bad = bench.records().into_iter().filter(|it| it.start >= from && it.outcome != Outcome::Good).count();
+    let bad =
+        bench.records().into_iter().filter(|it| it.start >= from && it.outcome != Outcome::Good).count();
     assert!(bad <= 4, "{bad} frames, where a frame of the device is cut at each gap");
     bench.call_back();
     // Nothing keeps it back (docs/protocol.md).
     assert_eq!(bench.number(0x2007, 2), 255);
+}
+
+/// A host whose device loses its crystal with the host's frame of this number, for this many ms.
+struct Gap<'b>(&'b mut Bench, u32, u64);
+
+impl Adapter for Gap<'_> {
+    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
+        let Self(bench, frames, ms) = self;
+        Adapter::send(*bench, frame)?;
+        *frames = frames.wrapping_sub(1);
+        if *frames == 0 {
+            bench.machine().set_crystal(0);
+            bench.run_ms(*ms);
+            bench.machine().set_crystal(bsp::CLOCK_TREE.hse);
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
+        Adapter::receive(self.0, timeout)
+    }
+
+    fn now(&self) -> Duration {
+        Adapter::now(self.0)
+    }
+}
+
+/// Whatever a gap comes into, the device is there after it, at once if the crystal starts again and after a power-off
+/// otherwise, and takes the program.
+#[test]
+fn a_gap_of_the_crystal_at_any_point_of_an_update_costs_the_attempt_alone() {
+    let mut before = Bench::new().switched_on();
+    before.install(firmware::APP_V1);
+    let cells = before.machine().flash().to_vec();
+    let update = |bench: &mut Bench, frame, ms| {
+        let mut host = Gap(bench, frame, ms);
+        let mut session = Session::new(&mut host, NodeId::new(NODE).unwrap(), Timing::default());
+        let file = firmware::blocks(firmware::APP_V2);
+        let result = flash(&mut session, file, &FlashOptions::default(), &mut |_| {});
+        (result.is_ok(), frame.wrapping_sub(host.1))
+    };
+    let start = || {
+        let mut bench = Bench::new();
+        bench.machine().load_bin(firmware::board().chip.flash.base, &cells).unwrap();
+        bench.power_on();
+        bench.await_program(1_000);
+        bench
+    };
+    let (is_done, frames) = update(&mut start(), 0, 0);
+    assert!(is_done);
+    let mut failed = 0;
+    for frame in [1, 3, 8, frames / 3, frames - 3, frames] {
+        for ms in [1, 2_000] {
+            let mut bench = start();
+            let (is_done, _) = update(&mut bench, frame, ms);
+            failed += u32::from(!is_done);
+            if ms > 1 {
+                bench.power_cycle();
+            }
+            bench.run_ms(1_000);
+            assert!(update(&mut bench, 0, 0).0, "frame {frame} of {frames}, {ms} ms");
+        }
+    }
+    assert!(failed > 3, "{failed}");
 }
 
 #[test]
