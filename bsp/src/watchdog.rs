@@ -2,9 +2,8 @@
 
 use stm32f4xx_hal::pac;
 
-/// How often the status is read before an update is given up: 3 ms at 168 MHz and 8 cycles a read. It takes
-/// 0.3 ms with the slowest LSI (17 kHz).
-const PATIENCE: u32 = 0xFFFF;
+/// How often the status is read before an update is given up: 0.1 s at 168 MHz and 8 cycles a read, 1 s from HSI.
+const PATIENCE: u32 = 1 << 21;
 
 /// Starts the watchdog: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to
 /// 8000. The LSI counts them (17 to 47 kHz for 32).
@@ -24,10 +23,11 @@ pub fn rescale(registers: &pac::IWDG, prescaler: u16) {
     run(registers, prescaler, 0xFFF);
 }
 
-/// Lets the watchdog run with these values. It waits for the LSI, 0.1 to 0.3 ms.
+/// Lets the watchdog run with these values. It waits for the LSI, which has 17 to 47 kHz.
 ///
 /// A watchdog starts with 4096 counts, and only AAAAh loads the reload value. Both values take up to five
-/// cycles of the LSI to get to the counter, and meanwhile no others may be written (section 21.4.4).
+/// cycles of the LSI to get to the counter, and meanwhile no others may be written (section 21.4.4). ST's HAL waits
+/// for five cycles behind the prescaler: then it is up to 75 ms at LSI / 256, and 1.2 ms at LSI / 4.
 fn run(registers: &pac::IWDG, prescaler: u16, reload: u16) {
     // SAFETY: the keys that start the counter and permit the two writes (section 21.4.1).
     let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });

@@ -38,10 +38,11 @@ fn wait(chip: &mut impl Registers, register: u32, mask: u32, value: u32) -> bool
 }
 
 /// Makes the independent watchdog run out in two counts of the LSI / 4, after the five periods that the
-/// values take to get to the counter (RM0090 section 21.4).
+/// values take to get to the counter (RM0090 section 21.4): of the LSI, or behind the prescaler, as ST's HAL has it.
 ///
 /// CCCCh starts the counter with FFFh, and only AAAAh loads RLR. The values must be there before, and may
-/// be written only while no others are on their way.
+/// be written only while no others are on their way. The waits have no bound: nothing else is left to do, and a
+/// watchdog that runs bites in them, too.
 pub(crate) fn start_watchdog(chip: &mut impl Registers) {
     const KR: u32 = 0x4000_3000;
     const PR: u32 = 0x4000_3004;
@@ -49,12 +50,11 @@ pub(crate) fn start_watchdog(chip: &mut impl Registers) {
     const SR: u32 = 0x4000_300C;
     const PVU_AND_RVU: u32 = 0b11;
     chip.write(KR, 0xCCCC);
-    wait(chip, SR, PVU_AND_RVU, 0);
+    while chip.read(SR) & PVU_AND_RVU != 0 {}
     for (register, value) in [(KR, 0x5555), (PR, 0), (RLR, 1)] {
         chip.write(register, value);
     }
-    // If they never get there, the counter is loaded with what it has.
-    wait(chip, SR, PVU_AND_RVU, 0);
+    while chip.read(SR) & PVU_AND_RVU != 0 {}
     chip.write(KR, 0xAAAA);
 }
 

@@ -21,6 +21,8 @@ pub struct Silicon {
     /// How many periods of the LSI a new value of IWDG_PR or IWDG_RLR takes to get to the counter: up to 5
     /// (RM0090 section 21.4.4).
     pub iwdg_update_periods: u32,
+    /// Whether these are periods behind the prescaler, as ST's HAL waits for.
+    pub iwdg_update_prescaled: bool,
     /// The value of SYST_CVR after a reset: unknown, 24 bits (ARMv7-M B3.3.5).
     pub systick_value: u32,
     /// Whether a wake-up from Standby sets PORRSTF, PINRSTF and BORRSTF, or no flag of RCC_CSR at all. RM0090
@@ -54,6 +56,7 @@ pub const TYPICAL: Silicon = Silicon {
     lsi_hz: 32_000,
     hsi_hz: 16_000_000,
     iwdg_update_periods: 5,
+    iwdg_update_prescaled: false,
     systick_value: 0,
     flags_after_standby: false,
     crystal_start_us: 2_000,
@@ -71,6 +74,7 @@ pub const WORST: Silicon = Silicon {
     lsi_hz: *LSI.end(),
     hsi_hz: *HSI.end(),
     iwdg_update_periods: *UPDATE.end(),
+    iwdg_update_prescaled: true,
     systick_value: *SYSTICK.end(),
     flags_after_standby: false,
     crystal_start_us: *CRYSTAL_START.end(),
@@ -116,6 +120,7 @@ impl Silicon {
             flash_slowness_permille: draw(FLASH_SLOWNESS),
             stale_lines: draw(0..=1) == 1,
             pll_free_hz: draw(PLL_FREE),
+            iwdg_update_prescaled: draw(0..=1) == 1,
         }
     }
 }
@@ -131,10 +136,11 @@ impl fmt::Display for Silicon {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
         let Self { crystal_start_us, pll_free_hz, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
+        let of = if self.iwdg_update_prescaled { "prescaled LSI" } else { "LSI" };
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
             f,
-            "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
+            "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, {of} periods per write to the watchdog: {iwdg_update_periods}, SysTick \
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
              PLL without an input: {pll_free_hz} Hz, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \

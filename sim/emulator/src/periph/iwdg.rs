@@ -105,7 +105,7 @@ impl Iwdg {
         if is_on != self.lsi_is_on {
             self.settle(now);
             self.lsi_is_on = is_on;
-            let ends = self.update_ends(now);
+            let ends = self.update_ends(now, 0);
             for register in [&mut self.prescaler, &mut self.reload] {
                 register.ends = register.ends.map(|_| ends);
             }
@@ -120,8 +120,11 @@ impl Iwdg {
         self.counter = Some(Counter { value: self.reload.used, at: now });
     }
 
-    fn update_ends(&self, now: Time) -> Time {
-        let periods = self.silicon.iwdg_update_periods.into();
+    /// When an update that begins now ends, which may be one to this prescaler.
+    fn update_ends(&self, now: Time, prescaler: u32) -> Time {
+        let prescaler = prescaler.max(self.prescaler.used).max(self.prescaler.written);
+        let of = if self.silicon.iwdg_update_prescaled { divider(prescaler) } else { 1 };
+        let periods = u64::from(self.silicon.iwdg_update_periods) * of;
         if self.lsi_is_on {
             now + Span(picos_of(periods, self.silicon.lsi_hz.into()))
         } else {
@@ -210,7 +213,7 @@ impl Peripheral for Iwdg {
 
     fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
         self.settle(now);
-        let ends = self.update_ends(now);
+        let ends = self.update_ends(now, if offset == 0x04 { value & 7 } else { 0 });
         let (register, mask) = match offset {
             0x00 => return self.write_key(value & 0xFFFF, now),
             0x04 => (&mut self.prescaler, 7),
