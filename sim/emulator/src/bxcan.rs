@@ -24,7 +24,7 @@ mod tests;
 use crate::bus::confinement::{Confinement, ErrorState};
 use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Pins, Wait};
 use crate::frame::{Frame, INTERMISSION_BITS};
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::silicon::{self, Silicon};
 use crate::time::{Span, Time};
 use filters::{Filters, Share};
@@ -218,12 +218,12 @@ impl BxCan {
     /// Checks that this controller has a register at `offset`.
     fn check(&self, offset: u32) -> Result<(), Unmodelled> {
         match (self.share, offset) {
-            (Share::Can2, 0x200..) => Err(Unmodelled(format!(
+            (Share::Can2, 0x200..) => unmodelled(format!(
                 "CAN2 has no filter registers (offset {offset:#x}): its banks are set in CAN1's"
-            ))),
-            (Share::Can2, 0x180..=0x1CC) if !self.master_clocked => Err(Unmodelled(format!(
+            )),
+            (Share::Can2, 0x180..=0x1CC) if !self.master_clocked => unmodelled(format!(
                 "CAN1 has no clock (RCC enables it): CAN2 does not reach its mailboxes (offset {offset:#x})"
-            ))),
+            )),
             _ => Ok(()),
         }
     }
@@ -506,9 +506,9 @@ impl BxCan {
         let order = self.requests;
         let mailbox = &mut self.mailboxes[n];
         if mailbox.state != MailboxState::Empty {
-            return Err(Unmodelled(format!(
+            return unmodelled(format!(
                 "transmit mailbox {n} is written while it is not empty (TME{n} = 0): the write has no effect"
-            )));
+            ));
         }
         match register {
             0x0 => {
@@ -524,7 +524,7 @@ impl BxCan {
             0x4 => {
                 mailbox.tdtr = value & 0xF;
                 if value & TGT != 0 {
-                    return Err(Unmodelled(format!("TDT{n}R.TGT: transmit global time is not modelled")));
+                    return unmodelled(format!("TDT{n}R.TGT: transmit global time is not modelled"));
                 }
             }
             0x8 => mailbox.tdlr = value,
@@ -544,10 +544,10 @@ impl BxCan {
         };
         if needed {
             let name = self.name();
-            return Err(Unmodelled(format!(
+            return unmodelled(format!(
                 "{name} sends, and no pin of this package has its {missing} (GPIO: MODER 10b and the alternate \
                  function): set up a pin that the package has, nothing is received or heard until then"
-            )));
+            ));
         }
         Ok(())
     }
@@ -743,7 +743,7 @@ impl Peripheral for BxCan {
                 }
                 self.follow_mode_bits(now);
                 if value & !(mcr::KEPT | mcr::RESET) != 0 {
-                    return Err(Unmodelled(format!("MCR: reserved bits set in {value:#010x}")));
+                    return unmodelled(format!("MCR: reserved bits set in {value:#010x}"));
                 }
             }
             0x04 => self.msr_flags &= !(value & (msr::ERRI | msr::WKUI | msr::SLAKI)),
@@ -753,7 +753,7 @@ impl Peripheral for BxCan {
             0x14 => {
                 self.ier = value & ier::ALL;
                 if value & !ier::ALL != 0 {
-                    return Err(Unmodelled(format!("IER: reserved bits set in {value:#010x}")));
+                    return unmodelled(format!("IER: reserved bits set in {value:#010x}"));
                 }
             }
             0x18 if self.is_frozen() => {}
@@ -764,9 +764,7 @@ impl Peripheral for BxCan {
                     Mode::Resting(Rest::Initialisation)
                         | Mode::Synchronising { from: Rest::Initialisation, .. }
                 ) {
-                    return Err(Unmodelled(
-                        "BTR is written outside initialisation mode: the write has no effect".into(),
-                    ));
+                    return unmodelled("BTR is written outside initialisation mode: the write has no effect");
                 }
                 self.btr = value & btr::ALL;
             }
@@ -774,9 +772,7 @@ impl Peripheral for BxCan {
             _ => match mail(offset) {
                 Some(Mail::Transmit(n, register)) => self.write_mailbox(n, register, value, now)?,
                 Some(Mail::Receive(n, _)) => {
-                    return Err(Unmodelled(format!(
-                        "receive mailbox {n} is written: its registers are read-only"
-                    )))
+                    return unmodelled(format!("receive mailbox {n} is written: its registers are read-only"))
                 }
                 None => return Err(self.no_register(offset)),
             },

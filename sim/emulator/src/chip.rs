@@ -664,12 +664,8 @@ impl Chip {
         event.filter(|&event| event > now).map_or(self.slice.deadline, |event| event.min(self.slice.deadline))
     }
 
-    /// Sets the end of the CPU's run to the deadline or the next event, whichever comes first.
-    pub fn limit_slice(&mut self) {
-        self.end_slice_at(self.next_event());
-    }
-
-    fn end_slice_at(&mut self, event: Option<Time>) {
+    /// Sets the end of the CPU's run to the deadline or this event, whichever comes first.
+    pub fn end_slice_at(&mut self, event: Option<Time>) {
         let until = self.stop_before(event);
         self.slice.end = self.clock.cycle_at(until);
     }

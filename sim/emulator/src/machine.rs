@@ -145,12 +145,16 @@ impl Machine {
             return if is_open { Ok(()) } else { Err(refused) };
         }
         let offset = self.check_flash(address, bytes.len())?;
-        let chip = self.cpu.chip_mut();
-        chip.flash.preset(offset, bytes);
-        let changed = chip.flash.take_changed();
-        let base = chip.geometry.flash.base;
-        chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        self.cpu.chip_mut().flash.preset(offset, bytes);
+        self.note_stale();
         Ok(())
+    }
+
+    /// The code that the CPU has of the changed parts of the flash is an old one.
+    fn note_stale(&mut self) {
+        let chip = self.cpu.chip_mut();
+        let (changed, base) = (chip.flash.take_changed(), chip.geometry.flash.base);
+        chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
     }
 
     /// Puts a program into the system memory, in place of ST's loader, which is not there. It is at 1FFF_0000h.
@@ -339,9 +343,7 @@ impl Machine {
         let chip = self.cpu.chip_mut();
         assert_eq!(cells.bytes.len(), chip.geometry.flash.size as usize, "cells of another chip");
         chip.flash.preset_cells(cells, seed);
-        let base = chip.geometry.flash.base;
-        let changed = chip.flash.take_changed();
-        chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        self.note_stale();
     }
 
     // --- time
@@ -483,7 +485,8 @@ impl Machine {
             let entry = self.cpu.enter_exception(exception);
             return self.debugger.note_exception(entry);
         }
-        self.cpu.chip_mut().limit_slice();
+        let chip = self.cpu.chip_mut();
+        chip.end_slice_at(chip.next_event());
         let Some(exit) = self.debugger.run_code(&mut self.cpu) else { return Entry::Taken };
         match exit {
             Exit::Slice => Entry::Taken,

@@ -6,6 +6,11 @@ use crate::time::Time;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Unmodelled(pub String);
 
+/// Says what is not modelled.
+pub(crate) fn unmodelled<T>(what: impl Into<String>) -> Result<T, Unmodelled> {
+    Err(Unmodelled(what.into()))
+}
+
 /// A memory-mapped block of registers.
 ///
 /// The machine hands in word-aligned accesses; it takes care of bytes, half-words and bit-band
@@ -35,6 +40,14 @@ pub trait Peripheral {
     /// The NVIC lines that this block holds active (level), as interrupt numbers.
     fn interrupts(&self, active: &mut Vec<u16>) {
         let _ = active;
+    }
+
+    /// These lines alone.
+    #[cfg(test)]
+    fn active(&self) -> Vec<u16> {
+        let mut active = Vec::new();
+        self.interrupts(&mut active);
+        active
     }
 
     /// System reset. The model decides what survives it (RAM, the reset flags, the watchdog's

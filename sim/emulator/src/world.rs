@@ -418,29 +418,10 @@ mod tests {
     impl Scripted {
         fn new(id: u16, period: Span, step: Span) -> Self {
             let mut can = BxCan::new();
-            can.set_clock(42_000_000);
-            for (offset, value) in [
-                (0x00, 0x1_0001),
-                (0x1C, 0x001A_0002),
-                (0x20C, 1),
-                (0x21C, 1),
-                (0x200, 0x2A1C_0E00),
-                (0x00, 0x1_0004), // TXFP
-            ] {
-                can.write(offset, value, Time(0)).unwrap();
-            }
-            let next_send = Time(0) + period;
-            Self {
-                can,
-                now: Time(0),
-                powered: true,
-                id,
-                period,
-                next_send,
-                step,
-                seen: Vec::new(),
-                stuck: false,
-            }
+            // TXFP.
+            can.set_up(4, 0);
+            let (now, next_send, seen) = (Time(0), Time(0) + period, Vec::new());
+            Self { can, now, powered: true, id, period, next_send, step, seen, stuck: false }
         }
 
         fn transmit(&mut self, id: u16) {

@@ -114,19 +114,8 @@ fn boot_up() -> Frame {
 /// and LBKM.
 fn controller(btr: u32, mcr: u32) -> Node {
     let mut can = BxCan::new();
-    can.set_clock(42_000_000);
-    let at = Time(0);
-    can.resolved(at);
-    for (offset, value) in [
-        (0x00, 0x1_0001),
-        (0x1C, 0x001A_0002 | btr), // 3 x 14 cycles of 42 MHz
-        (0x20C, 1),
-        (0x21C, 1),
-        (0x200, 0x2A1C_0E00),
-        (0x00, 0x1_0000 | mcr),
-    ] {
-        can.write(offset, value, at).unwrap();
-    }
+    can.resolved(Time(0));
+    can.set_up(mcr, btr);
     Node::Can(Box::new(can))
 }
 

@@ -2,7 +2,7 @@
 //! filtering").
 
 use crate::frame::{Frame, Id};
-use crate::peripheral::Unmodelled;
+use crate::peripheral::{unmodelled, Unmodelled};
 
 /// Banks of the dual bxCAN.
 pub const BANKS: usize = 28;
@@ -128,9 +128,7 @@ impl Filters {
             if self.fmr & FINIT != 0 {
                 Ok(value & ALL_BANKS)
             } else {
-                Err(Unmodelled(format!(
-                    "{name} is written while FMR.FINIT is clear: the write has no effect"
-                )))
+                unmodelled(format!("{name} is written while FMR.FINIT is clear: the write has no effect"))
             }
         };
         match offset {
@@ -142,9 +140,9 @@ impl Filters {
             _ => {
                 let (bank, half) = bank(offset)?;
                 if self.fmr & FINIT == 0 && self.active >> bank & 1 == 1 {
-                    return Err(Unmodelled(format!(
+                    return unmodelled(format!(
                         "filter bank {bank} is written while it is active and FMR.FINIT is clear: the write has no effect"
-                    )));
+                    ));
                 }
                 self.banks[bank][half] = value;
             }
@@ -221,7 +219,7 @@ fn bank(offset: u32) -> Result<(usize, usize), Unmodelled> {
     let word = offset.checked_sub(0x240).map(|n| (n / 4) as usize);
     match word {
         Some(word) if word < 2 * BANKS && offset.is_multiple_of(4) => Ok((word / 2, word % 2)),
-        _ => Err(Unmodelled(format!("no filter register at offset {offset:#x}"))),
+        _ => unmodelled(format!("no filter register at offset {offset:#x}")),
     }
 }
 

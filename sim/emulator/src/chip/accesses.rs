@@ -11,7 +11,7 @@ use crate::costs::CRC_WORD;
 use crate::memory::PAGE;
 use crate::periph::flash::Store;
 use crate::periph::rcc::{self, ResetCause};
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::report::{Access, Report};
 use crate::time::Time;
 
@@ -168,7 +168,7 @@ impl Chip {
             }
             Place::Block { block, .. } => {
                 let name = self.block_mut(block).name();
-                Err(Unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0")))
+                unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0"))
             }
             Place::Scs(offset) => {
                 let now = self.clock.time_of(self.cycle_of_access());
@@ -207,7 +207,7 @@ impl Chip {
             }
             Place::Block { block, .. } => {
                 let name = self.block_mut(block).name();
-                Err(Unmodelled(format!("{name} has no clock (RCC enables it); the write is lost")))
+                unmodelled(format!("{name} has no clock (RCC enables it); the write is lost"))
             }
             Place::Scs(offset) => {
                 let now = self.clock.time_of(self.cycle_of_access());

@@ -7,7 +7,7 @@ use super::exceptions::{
     SV_CALL, SYS_TICK, USAGE_FAULT,
 };
 use super::systick::SysTick;
-use crate::peripheral::Unmodelled;
+use crate::peripheral::{unmodelled, Unmodelled};
 use crate::time::Time;
 
 /// CFSR bits (PM0214 section 4.4.10 and following).
@@ -272,7 +272,8 @@ impl Scs {
             0x010 => self.systick.read_csr(),
             0x014 => self.systick.read_reload(),
             0x018 => self.systick.read_value(now),
-            0x01C => self.systick.read_calib(),
+            // SYST_CALIB: TENMS is 18750 (1 ms at 150 MHz / 8), NOREF 0, SKEW 1 (PM0214 section 4.5.4).
+            0x01C => 0x4000_493E,
             0x100..=0x13C | 0x180..=0x1BC => self.exceptions.lines(LineSet::Enabled, row / 4),
             0x200..=0x23C | 0x280..=0x2BC => self.exceptions.lines(LineSet::Pending, row / 4),
             0x300..=0x33C => self.exceptions.lines(LineSet::Active, row / 4),
@@ -357,7 +358,7 @@ impl Scs {
                 return Ok(Effect::FpuAccess);
             }
             0xD94 if value == 0 => {}
-            0xD94 => return Err(Unmodelled("the MPU is switched on; it is not modelled".into())),
+            0xD94 => return unmodelled("the MPU is switched on; it is not modelled"),
             0xDF8 => self.debug.dcrdr = value,
             0xDFC => {
                 if self.debug.write_demcr(value) {
@@ -471,7 +472,7 @@ impl Scs {
 
     fn write_aircr(&mut self, value: u32) -> Result<Effect, Unmodelled> {
         if value & 0xFFFF_0000 != AIRCR_KEY {
-            return Err(Unmodelled("AIRCR is written without its key 05FAh: the core ignores it".into()));
+            return unmodelled("AIRCR is written without its key 05FAh: the core ignores it");
         }
         self.exceptions.prigroup = u8::try_from((value & AIRCR_PRIGROUP) >> 8).unwrap_or(0);
         Ok(if value & AIRCR_SYSRESETREQ != 0 { Effect::SystemReset } else { Effect::None })

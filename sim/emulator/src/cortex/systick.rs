@@ -166,13 +166,6 @@ impl SysTick {
         self.value = 0;
         self.csr &= !CSR_COUNTFLAG;
     }
-
-    /// SYST_CALIB: on the STM32F4 TENMS is 18750 (1 ms at 150 MHz / 8), NOREF 0, SKEW 1 (PM0214
-    /// section 4.5.4; the reset value 4000493Eh).
-    #[must_use]
-    pub fn read_calib(&self) -> u32 {
-        0x4000_493E
-    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! CRC calculation unit (RM0090 section 4).
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::time::Time;
 
 const POLYNOMIAL: u32 = 0x04C1_1DB7;
@@ -29,7 +29,7 @@ impl Peripheral for Crc {
             0x00 => Ok(self.data),
             0x04 => Ok(self.independent),
             0x08 => Ok(0),
-            _ => Err(Unmodelled("the CRC unit has no such register".into())),
+            _ => unmodelled("the CRC unit has no such register"),
         }
     }
 
@@ -45,7 +45,7 @@ impl Peripheral for Crc {
             0x04 => self.independent = value & 0xFF,
             0x08 if value & 1 != 0 => self.data = u32::MAX,
             0x08 => {}
-            _ => return Err(Unmodelled("the CRC unit has no such register".into())),
+            _ => return unmodelled("the CRC unit has no such register"),
         }
         Ok(())
     }

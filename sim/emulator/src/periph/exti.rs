@@ -3,7 +3,7 @@
 //!
 //! A wake-up by an event (EMR) needs nothing here: WFE ends by itself in this model.
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::time::Time;
 
 const IMR: u32 = 0x00;
@@ -66,7 +66,7 @@ impl Peripheral for Exti {
             FTSR => self.ftsr,
             SWIER => self.swier,
             PR => self.pr,
-            _ => return Err(Unmodelled("EXTI has no such register".into())),
+            _ => return unmodelled("EXTI has no such register"),
         })
     }
 
@@ -87,23 +87,18 @@ impl Peripheral for Exti {
                 self.pr &= !value;
                 self.swier &= !value;
             }
-            _ => return Err(Unmodelled("EXTI has no such register".into())),
+            _ => return unmodelled("EXTI has no such register"),
         }
         if matches!(offset, RTSR | FTSR) && value & !FOLLOWED != 0 {
-            return Err(Unmodelled(
-                "what is behind EXTI lines 17 to 22 (RTC, USB, Ethernet) is not modelled".into(),
-            ));
+            return unmodelled("what is behind EXTI lines 17 to 22 (RTC, USB, Ethernet) is not modelled");
         }
         Ok(())
     }
 
     fn interrupts(&self, active: &mut Vec<u16>) {
         let pending = self.pr & self.imr;
-        if pending != 0 {
-            active.extend(
-                (0..).zip(NVIC).filter(|(line, _)| pending & 1 << line != 0).map(|(_, number)| number),
-            );
-        }
+        let of_nvic = (0..).zip(NVIC).filter(|(line, _)| pending & 1 << line != 0);
+        active.extend(of_nvic.map(|(_, number)| number));
     }
 
     fn reset(&mut self) {
@@ -115,12 +110,6 @@ impl Peripheral for Exti {
 mod tests {
     use super::*;
 
-    fn lines(exti: &Exti) -> Vec<u16> {
-        let mut active = Vec::new();
-        exti.interrupts(&mut active);
-        active
-    }
-
     /// Section 12.2.5: the edges that RTSR and FTSR name set PR; IMR lets it through.
     #[test]
     fn edges_that_are_asked_for_become_pending() {
@@ -129,13 +118,13 @@ mod tests {
         exti.write(FTSR, 1 << 13 | 1 << 7, Time(0)).unwrap();
         exti.settle(1 << 13);
         exti.show(1 << 13 | 1 << 3);
-        assert_eq!((exti.read(PR, Time(0)), lines(&exti)), (Ok(1 << 3), vec![]), "masked");
+        assert_eq!((exti.read(PR, Time(0)), exti.active()), (Ok(1 << 3), vec![]), "masked");
         exti.write(IMR, LINES, Time(0)).unwrap();
-        assert_eq!(lines(&exti), [9]);
+        assert_eq!(exti.active(), [9]);
         exti.write(PR, 1 << 3, Time(0)).unwrap();
         exti.show(1 << 7);
         assert_eq!(exti.read(PR, Time(0)), Ok(1 << 13 | 1 << 7));
-        assert_eq!(lines(&exti), [23, 40]);
+        assert_eq!(exti.active(), [23, 40]);
         exti.write(PR, 1 << 7, Time(0)).unwrap();
         exti.show(0);
         assert_eq!(exti.read(PR, Time(0)), Ok(1 << 13 | 1 << 7), "the other edge");
@@ -149,7 +138,7 @@ mod tests {
         exti.write(RTSR, 1 << 16, Time(0)).unwrap();
         assert!(exti.listens());
         exti.show(1 << 16);
-        assert_eq!((exti.read(PR, Time(0)), lines(&exti)), (Ok(1 << 16), vec![1]));
+        assert_eq!((exti.read(PR, Time(0)), exti.active()), (Ok(1 << 16), vec![1]));
         assert!(exti.write(RTSR, 1 << 17, Time(0)).is_err());
     }
 
@@ -159,8 +148,8 @@ mod tests {
         let mut exti = Exti::default();
         exti.write(IMR, 1 << 17, Time(0)).unwrap();
         exti.write(SWIER, 1 << 17, Time(0)).unwrap();
-        assert_eq!(lines(&exti), [41]);
+        assert_eq!(exti.active(), [41]);
         exti.write(PR, 1 << 17, Time(0)).unwrap();
-        assert_eq!((exti.read(SWIER, Time(0)), lines(&exti)), (Ok(0), vec![]));
+        assert_eq!((exti.read(SWIER, Time(0)), exti.active()), (Ok(0), vec![]));
     }
 }

@@ -18,7 +18,7 @@ use shared_abi::geometry::{Geometry, Sector};
 
 use crate::memory::HostMemory;
 use crate::noise::Noise;
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::silicon::Silicon;
 use crate::supply::NOMINAL;
 use crate::time::{Span, Time};
@@ -553,7 +553,7 @@ impl Flash {
                     Some(sector) => vec![sector],
                     None => {
                         self.refuse(SR_PGSERR, "no such sector");
-                        return Err(Unmodelled(format!("FLASH_CR.SNB is {code:05b}b: that names no sector")));
+                        return unmodelled(format!("FLASH_CR.SNB is {code:05b}b: that names no sector"));
                     }
                 }
             }
@@ -566,12 +566,12 @@ impl Flash {
                 .collect(),
             _ => {
                 self.refuse(SR_PGSERR, "neither SER nor MER");
-                return Err(Unmodelled("FLASH_CR.STRT without exactly one of SER and MER".into()));
+                return unmodelled("FLASH_CR.STRT without exactly one of SER and MER");
             }
         };
         if self.cr & CR_PG != 0 {
             self.refuse(SR_PGSERR, "PG is set");
-            return Err(Unmodelled("FLASH_CR.STRT while PG is set".into()));
+            return unmodelled("FLASH_CR.STRT while PG is set");
         }
         if sectors.iter().any(|&sector| self.is_protected(sector)) {
             self.refuse(SR_WRPERR, "the option bytes protect the sector");
@@ -652,18 +652,17 @@ impl Flash {
     fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
         self.lock = self.lock.turn(value, KEYS);
         if self.lock == Lock::Barred {
-            return Err(Unmodelled(
+            return unmodelled(
                 "wrong key sequence at FLASH_KEYR: FLASH_CR is locked until the next reset, and the chip answers \
-                 with a bus error"
-                    .into(),
-            ));
+                 with a bus error",
+            );
         }
         Ok(())
     }
 
     fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
         if !self.lock.is_open() {
-            return Err(Unmodelled("FLASH_CR is written while it is locked: the chip ignores it".into()));
+            return unmodelled("FLASH_CR is written while it is locked: the chip ignores it");
         }
         let start = self.wait_until_idle(now);
         let second_bank = if self.geometry.second_bank.is_some() { CR_MER1 } else { 0 };
@@ -722,7 +721,7 @@ impl Peripheral for Flash {
                 self.options.read(programming)
             }
             0x18 if self.geometry.second_bank.is_some() => self.options.read_second(),
-            _ => return Err(Unmodelled("the flash interface has no such register".into())),
+            _ => return unmodelled("the flash interface has no such register"),
         })
     }
 
@@ -759,7 +758,7 @@ impl Peripheral for Flash {
                 self.wait_until_idle(now);
                 self.options.write_second(value)
             }
-            _ => Err(Unmodelled("the flash interface has no such register".into())),
+            _ => unmodelled("the flash interface has no such register"),
         }
     }
 

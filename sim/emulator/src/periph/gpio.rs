@@ -1,6 +1,6 @@
 //! General-purpose I/O (RM0090 section 8).
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::time::Time;
 
 /// The levels that drive the pins from outside, in one word per level.
@@ -25,6 +25,8 @@ pub struct Gpio {
     outside: Outside,
 }
 
+const NAMES: [&str; 11] =
+    ["GPIOA", "GPIOB", "GPIOC", "GPIOD", "GPIOE", "GPIOF", "GPIOG", "GPIOH", "GPIOI", "GPIOJ", "GPIOK"];
 const OUTPUT: u32 = 1;
 const ALTERNATE: u32 = 2;
 
@@ -32,19 +34,6 @@ impl Gpio {
     /// Port `port`, one of `'A'` to `'K'`.
     #[must_use]
     pub fn new(port: char) -> Self {
-        let name = match port {
-            'A' => "GPIOA",
-            'B' => "GPIOB",
-            'C' => "GPIOC",
-            'D' => "GPIOD",
-            'E' => "GPIOE",
-            'F' => "GPIOF",
-            'G' => "GPIOG",
-            'H' => "GPIOH",
-            'I' => "GPIOI",
-            'J' => "GPIOJ",
-            _ => "GPIOK",
-        };
         // PA13, PA14, PA15 and PB3, PB4 wake up as debug pins (section 8.4, reset values).
         let (moder, ospeedr, pupdr) = match port {
             'A' => (0xA800_0000, 0x0C00_0000, 0x6400_0000),
@@ -53,7 +42,7 @@ impl Gpio {
         };
         Self {
             port,
-            name,
+            name: NAMES[port as usize - 'A' as usize],
             moder,
             otyper: 0,
             ospeedr,
@@ -129,7 +118,7 @@ impl Peripheral for Gpio {
             0x1C => self.lckr,
             0x20 => self.afr[0],
             0x24 => self.afr[1],
-            _ => return Err(Unmodelled("a GPIO port has no such register".into())),
+            _ => return unmodelled("a GPIO port has no such register"),
         })
     }
 
@@ -148,11 +137,11 @@ impl Peripheral for Gpio {
             0x18 => self.odr = self.odr & !((value >> 16) as u16) | low,
             0x1C => {
                 self.lckr = value & 0x1_FFFF;
-                return Err(Unmodelled("the lock of a GPIO port is not modelled".into()));
+                return unmodelled("the lock of a GPIO port is not modelled");
             }
             0x20 => self.afr[0] = value,
             0x24 => self.afr[1] = value,
-            _ => return Err(Unmodelled("a GPIO port has no such register".into())),
+            _ => return unmodelled("a GPIO port has no such register"),
         }
         Ok(())
     }

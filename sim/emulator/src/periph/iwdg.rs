@@ -1,7 +1,7 @@
 //! Independent watchdog (RM0090 section 21).
 
 use crate::clock::{picos_of, ticks_in};
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::silicon::Silicon;
 use crate::time::{Span, Time};
 
@@ -182,7 +182,7 @@ impl Iwdg {
             }
             KEY_START if !self.is_running() => self.counter = Some(Counter { value: FIRST, at: now }),
             KEY_RELOAD | KEY_START | KEY_ACCESS | 0 => {}
-            _ => return Err(Unmodelled("the IWDG knows no such key".into())),
+            _ => return unmodelled("the IWDG knows no such key"),
         }
         Ok(())
     }
@@ -207,7 +207,7 @@ impl Peripheral for Iwdg {
                 let flag = |register: &Crossing, bit| register.ends.map_or(0, |_| bit);
                 flag(&self.prescaler, SR_PVU) | flag(&self.reload, SR_RVU)
             }
-            _ => return Err(Unmodelled("the IWDG has no such register".into())),
+            _ => return unmodelled("the IWDG has no such register"),
         })
     }
 
@@ -219,18 +219,15 @@ impl Peripheral for Iwdg {
             0x04 => (&mut self.prescaler, 7),
             0x08 => (&mut self.reload, 0xFFF),
             0x0C => return Ok(()),
-            _ => return Err(Unmodelled("the IWDG has no such register".into())),
+            _ => return unmodelled("the IWDG has no such register"),
         };
         if !self.unlocked {
-            return Err(Unmodelled(
-                "IWDG_PR and IWDG_RLR are write protected: write 5555h to KR first".into(),
-            ));
+            return unmodelled("IWDG_PR and IWDG_RLR are write protected: write 5555h to KR first");
         }
         if register.ends.is_some() {
-            return Err(Unmodelled(
-                "the value before is still on its way to the counter, this one is lost: wait until IWDG_SR is 0"
-                    .into(),
-            ));
+            return unmodelled(
+                "the value before is still on its way to the counter, this one is lost: wait until IWDG_SR is 0",
+            );
         }
         register.written = value & mask;
         register.ends = Some(ends);

@@ -1,6 +1,6 @@
 //! Power controller (RM0090 section 5, RM0390 section 5).
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::supply::NOMINAL;
 use crate::time::Time;
 use crate::variant::Variant;
@@ -140,7 +140,7 @@ impl Peripheral for Pwr {
         match offset {
             0x00 => Ok(self.cr),
             0x04 => Ok(self.csr | CSR_VOSRDY | if self.is_low { CSR_PVDO } else { 0 }),
-            _ => Err(Unmodelled("PWR has no such register".into())),
+            _ => unmodelled("PWR has no such register"),
         }
     }
 
@@ -158,16 +158,16 @@ impl Peripheral for Pwr {
                     self.restart_pvd();
                 }
                 if value & CR_OVER_DRIVE != 0 {
-                    return Err(Unmodelled("over-drive is not modelled, or the chip has none".into()));
+                    return unmodelled("over-drive is not modelled, or the chip has none");
                 }
             }
             0x04 => {
                 self.csr = self.csr & !CSR_EWUP | value & CSR_EWUP;
                 if value & 1 << 9 != 0 {
-                    return Err(Unmodelled("the backup regulator is not modelled".into()));
+                    return unmodelled("the backup regulator is not modelled");
                 }
             }
-            _ => return Err(Unmodelled("PWR has no such register".into())),
+            _ => return unmodelled("PWR has no such register"),
         }
         Ok(())
     }

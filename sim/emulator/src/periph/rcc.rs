@@ -1,6 +1,6 @@
 //! Reset and clock control (RM0090 sections 6 and 7, RM0390 section 6).
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::silicon::Silicon;
 use crate::time::{Span, Time};
 use crate::variant::{Plain, Variant};
@@ -109,6 +109,11 @@ impl Source {
         matches!(self, Source::On { ready } if ready <= now)
     }
 
+    /// Its two bits in a register.
+    fn bits(self, on: u32, ready: u32, now: Time) -> u32 {
+        (if self.is_on() { on } else { 0 }) | (if self.is_ready(now) { ready } else { 0 })
+    }
+
     fn next_event(self, now: Time) -> Option<Time> {
         match self {
             Source::On { ready } if ready > now => Some(ready),
@@ -126,8 +131,6 @@ pub const AHB2ENR: u32 = 0x34;
 /// Offset of RCC_DCKCFGR, on the chips that have it.
 const DCKCFGR: u32 = 0x8C;
 const DCKCFGR_TIMPRE: u32 = 1 << 24;
-/// Offset of RCC_AHB3ENR.
-pub const AHB3ENR: u32 = 0x38;
 /// Offset of RCC_APB1ENR.
 pub const APB1ENR: u32 = 0x40;
 /// Offset of RCC_APB2ENR.
@@ -338,15 +341,12 @@ impl Rcc {
     }
 
     fn cr(&self, now: Time) -> u32 {
-        let bits = |source: Source, on, ready| {
-            (if source.is_on() { on } else { 0 }) | (if source.is_ready(now) { ready } else { 0 })
-        };
         let hse_ready = if self.hse_hz > 0 { CR_HSERDY } else { 0 };
         self.cr_rest
-            | bits(self.hsi, CR_HSION, CR_HSIRDY)
-            | bits(self.hse, CR_HSEON, hse_ready)
-            | bits(self.pll, CR_PLLON, CR_PLLRDY)
-            | bits(self.plli2s, CR_PLLI2SON, CR_PLLI2SRDY)
+            | self.hsi.bits(CR_HSION, CR_HSIRDY, now)
+            | self.hse.bits(CR_HSEON, hse_ready, now)
+            | self.pll.bits(CR_PLLON, CR_PLLRDY, now)
+            | self.plli2s.bits(CR_PLLI2SON, CR_PLLI2SRDY, now)
     }
 
     fn write_cr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
@@ -360,12 +360,10 @@ impl Rcc {
         self.pll.switch(value & CR_PLLON != 0 || pll_fed, PLL_LOCK, now);
         self.plli2s.switch(value & CR_PLLI2SON != 0, PLL_LOCK, now);
         if self.hse_hz == 0 && value & CR_HSEON != 0 {
-            return Err(Unmodelled(
-                "HSEON is set, but this board has no crystal: HSERDY will never come".into(),
-            ));
+            return unmodelled("HSEON is set, but this board has no crystal: HSERDY will never come");
         }
         if value & CR_PLLSAION != 0 {
-            return Err(Unmodelled("the PLL for SAI and display is not modelled".into()));
+            return unmodelled("the PLL for SAI and display is not modelled");
         }
         Ok(())
     }
@@ -381,16 +379,8 @@ impl Peripheral for Rcc {
         Ok(match offset {
             0x00 => self.cr(now),
             0x08 => self.cfgr | self.sws << 2,
-            0x70 => {
-                self.bdcr_rest
-                    | (if self.lse.is_on() { BDCR_LSEON } else { 0 })
-                    | (if self.lse.is_ready(now) { BDCR_LSERDY } else { 0 })
-            }
-            0x74 => {
-                self.csr_flags
-                    | (if self.lsi.is_on() { CSR_LSION } else { 0 })
-                    | (if self.lsi.is_ready(now) { CSR_LSIRDY } else { 0 })
-            }
+            0x70 => self.bdcr_rest | self.lse.bits(BDCR_LSEON, BDCR_LSERDY, now),
+            0x74 => self.csr_flags | self.lsi.bits(CSR_LSION, CSR_LSIRDY, now),
             // CIR; the interrupts of ready clocks: see `write`.
             0x0C if self.has_failed => CIR_CSSF,
             0x0C => 0,
@@ -410,17 +400,17 @@ impl Peripheral for Rcc {
                 return result;
             }
             PLLCFGR if self.pll.is_on() => {
-                return Err(Unmodelled("PLLCFGR is written while the PLL is on: the chip ignores it".into()));
+                return unmodelled("PLLCFGR is written while the PLL is on: the chip ignores it");
             }
             SSCGR if self.pll.is_on() => {
-                return Err(Unmodelled("SSCGR is written while the PLL is on, which is not allowed".into()));
+                return unmodelled("SSCGR is written while the PLL is on, which is not allowed");
             }
             0x08 => {
                 self.cfgr = value & !0b1100;
                 self.follow_sw(now);
             }
             0x0C if value & 0xFF_FF00 & !0x9F_0000 != 0 => {
-                return Err(Unmodelled("the clock interrupts are not modelled".into()));
+                return unmodelled("the clock interrupts are not modelled");
             }
             0x0C => self.has_failed &= value & CIR_CSSC == 0,
             0x70 => {
@@ -516,17 +506,9 @@ mod tests {
         assert_eq!(rcc.clocks().hclk, 16_000_000);
         assert_eq!(rcc.next_event(), Some(Time(2 * MS) + PLL_LOCK));
         rcc.advance(Time(3 * MS));
-        let mhz = 1_000_000;
-        assert_eq!(
-            rcc.clocks(),
-            Clocks {
-                hclk: 168 * mhz,
-                pclk1: 42 * mhz,
-                pclk2: 84 * mhz,
-                timclk1: 84 * mhz,
-                timclk2: 168 * mhz
-            }
-        );
+        let Clocks { hclk, pclk1, pclk2, timclk1, timclk2 } = rcc.clocks();
+        let mhz = [hclk, pclk1, pclk2, timclk1, timclk2].map(|hz| f64::from(hz) / 1e6);
+        assert_eq!(mhz, [168.0, 42.0, 84.0, 84.0, 168.0]);
         assert_eq!(rcc.read(0x08, Time(3 * MS)).unwrap() & 0b1100, 0b1000);
         // Neither the PLL nor its source can be switched off now.
         rcc.write(0x00, CR_RESET, Time(3 * MS)).unwrap();

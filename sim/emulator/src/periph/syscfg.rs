@@ -1,6 +1,6 @@
 //! System configuration controller (RM0090 section 9).
 
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::time::Time;
 
 /// SYSCFG_MEMRMP.
@@ -59,7 +59,7 @@ impl Peripheral for Syscfg {
             0x08..=0x14 => self.exticr[(offset as usize - 8) / 4],
             // READY follows at once when the cell is powered.
             0x20 => self.cmpcr | self.cmpcr << 8,
-            _ => return Err(Unmodelled("SYSCFG has no such register".into())),
+            _ => return unmodelled("SYSCFG has no such register"),
         })
     }
 
@@ -67,14 +67,14 @@ impl Peripheral for Syscfg {
         match offset {
             0x00 if value & 7 < 2 => self.memrmp = value & (1 | UFB_MODE),
             0x00 => {
-                return Err(Unmodelled(
-                    "memory remap (SYSCFG_MEMRMP) to RAM or external memory: address 0 stays as it is".into(),
-                ));
+                return unmodelled(
+                    "memory remap (SYSCFG_MEMRMP) to RAM or external memory: address 0 stays as it is",
+                )
             }
             0x04 => self.pmc = value & 1 << 23,
             0x08..=0x14 => self.exticr[(offset as usize - 8) / 4] = value & 0xFFFF,
             0x20 => self.cmpcr = value & 1,
-            _ => return Err(Unmodelled("SYSCFG has no such register".into())),
+            _ => return unmodelled("SYSCFG has no such register"),
         }
         Ok(())
     }

@@ -9,7 +9,7 @@
 use std::collections::VecDeque;
 
 use crate::clock::picos_of;
-use crate::peripheral::{Peripheral, Unmodelled};
+use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 
 /// The place of a USART in the chip.
@@ -21,51 +21,33 @@ pub struct Instance {
     pub line: u16,
     /// Whether it is clocked from APB2; from APB1 otherwise.
     pub apb2: bool,
-    /// Pins that can be its transmitter: port, number, alternate function (datasheets, alternate
-    /// function mapping).
-    pub tx: &'static [(char, u8, u8)],
+    /// Pins that can be its transmitter.
+    pub tx: Pins,
     /// Pins that can be its receiver.
-    pub rx: &'static [(char, u8, u8)],
+    pub rx: Pins,
+}
+
+/// Port, number, alternate function (datasheets, alternate function mapping).
+type Pins = &'static [(char, u8, u8)];
+
+const fn instance(name: &'static str, line: u16, apb2: bool, tx: Pins, rx: Pins) -> Instance {
+    Instance { name, line, apb2, tx, rx }
 }
 
 /// The USARTs that every known chip has, with the pins that the chips have in common.
 pub static INSTANCES: [Instance; 6] = [
-    Instance {
-        name: "USART1",
-        line: 37,
-        apb2: true,
-        tx: &[('A', 9, 7), ('B', 6, 7)],
-        rx: &[('A', 10, 7), ('B', 7, 7)],
-    },
-    Instance {
-        name: "USART2",
-        line: 38,
-        apb2: false,
-        tx: &[('A', 2, 7), ('D', 5, 7)],
-        rx: &[('A', 3, 7), ('D', 6, 7)],
-    },
-    Instance {
-        name: "USART3",
-        line: 39,
-        apb2: false,
-        tx: &[('B', 10, 7), ('C', 10, 7), ('D', 8, 7)],
-        rx: &[('B', 11, 7), ('C', 11, 7), ('D', 9, 7)],
-    },
-    Instance {
-        name: "UART4",
-        line: 52,
-        apb2: false,
-        tx: &[('A', 0, 8), ('C', 10, 8)],
-        rx: &[('A', 1, 8), ('C', 11, 8)],
-    },
-    Instance { name: "UART5", line: 53, apb2: false, tx: &[('C', 12, 8)], rx: &[('D', 2, 8)] },
-    Instance {
-        name: "USART6",
-        line: 71,
-        apb2: true,
-        tx: &[('C', 6, 8), ('G', 14, 8)],
-        rx: &[('C', 7, 8), ('G', 9, 8)],
-    },
+    instance("USART1", 37, true, &[('A', 9, 7), ('B', 6, 7)], &[('A', 10, 7), ('B', 7, 7)]),
+    instance("USART2", 38, false, &[('A', 2, 7), ('D', 5, 7)], &[('A', 3, 7), ('D', 6, 7)]),
+    instance(
+        "USART3",
+        39,
+        false,
+        &[('B', 10, 7), ('C', 10, 7), ('D', 8, 7)],
+        &[('B', 11, 7), ('C', 11, 7), ('D', 9, 7)],
+    ),
+    instance("UART4", 52, false, &[('A', 0, 8), ('C', 10, 8)], &[('A', 1, 8), ('C', 11, 8)]),
+    instance("UART5", 53, false, &[('C', 12, 8)], &[('D', 2, 8)]),
+    instance("USART6", 71, true, &[('C', 6, 8), ('G', 14, 8)], &[('C', 7, 8), ('G', 9, 8)]),
 ];
 
 /// `USART_SR`.
@@ -335,10 +317,10 @@ impl Usart {
         let on = cr1::UE | cr1::TE;
         if self.cr1 & on == on && before & on != on {
             if self.divider().is_none() {
-                return Err(Unmodelled(
-                    "the transmitter is switched on without a bit rate (USART_BRR: 16 cycles a bit at least, 8 with OVER8)"
-                        .into(),
-                ));
+                return unmodelled(
+                    "the transmitter is switched on without a bit rate (USART_BRR: 16 cycles a bit at least, 8 with \
+                     OVER8)",
+                );
             }
             // Section 30.3.2: an idle frame goes first.
             self.begin(None, now);
@@ -348,18 +330,17 @@ impl Usart {
             self.to_send = None;
             self.flags = sr::AFTER_RESET;
         }
-        let unmodelled = self.cr1 & (cr1::SBK | cr1::RWU | cr1::IDLEIE | cr1::PCE | cr1::M);
-        match unmodelled {
+        match self.cr1 & (cr1::SBK | cr1::RWU | cr1::IDLEIE | cr1::PCE | cr1::M) {
             0 => Ok(()),
-            bits => Err(Unmodelled(format!(
+            bits => unmodelled(format!(
                 "of USART_CR1, {bits:04X}h is not modelled: break, mute mode, idle interrupt, parity, nine bits"
-            ))),
+            )),
         }
     }
 
     fn write_dr(&mut self, byte: u8, now: Time) -> Result<(), Unmodelled> {
         if !self.is_on(cr1::TE) {
-            return Err(Unmodelled("a character is written while the transmitter is off: it is lost".into()));
+            return unmodelled("a character is written while the transmitter is off: it is lost");
         }
         if self.seen & sr::TC != 0 {
             self.seen &= !sr::TC;
@@ -373,21 +354,15 @@ impl Usart {
             self.flags &= !sr::TXE;
         }
         if !self.wired.0 {
-            return Err(Unmodelled(format!(
-                "a character is sent, but no pin is the transmitter of {} (GPIO: alternate function of {})",
-                self.instance.name,
-                self.instance
-                    .tx
-                    .iter()
-                    .map(|(port, pin, _)| format!("P{port}{pin}"))
-                    .collect::<Vec<_>>()
-                    .join(", ")
-            )));
+            let Instance { name, tx, .. } = self.instance;
+            let pins: Vec<_> = tx.iter().map(|(port, pin, _)| format!("P{port}{pin}")).collect();
+            return unmodelled(format!(
+                "a character is sent, but no pin is the transmitter of {name} (GPIO: alternate function of {})",
+                pins.join(", ")
+            ));
         }
         if lost {
-            return Err(Unmodelled(
-                "a character is written although TXE is clear: the one before is lost".into(),
-            ));
+            return unmodelled("a character is written although TXE is clear: the one before is lost");
         }
         Ok(())
     }
@@ -416,7 +391,7 @@ impl Peripheral for Usart {
             0x10 => self.cr2,
             0x14 => self.cr3,
             0x18 => self.gtpr,
-            _ => return Err(Unmodelled("a USART has no such register".into())),
+            _ => return unmodelled("a USART has no such register"),
         })
     }
 
@@ -433,20 +408,19 @@ impl Peripheral for Usart {
             0x10 => {
                 self.cr2 = value & CR2_ALL;
                 if self.cr2 & !CR2_STOP != 0 {
-                    return Err(Unmodelled("of USART_CR2, only the stop bits are modelled".into()));
+                    return unmodelled("of USART_CR2, only the stop bits are modelled");
                 }
             }
             0x14 => {
                 self.cr3 = value & CR3_ALL;
                 if self.cr3 & !(CR3_EIE | CR3_ONEBIT) != 0 {
-                    return Err(Unmodelled(
-                        "of USART_CR3, DMA, flow control, smart cards, IrDA and half duplex are not modelled"
-                            .into(),
-                    ));
+                    return unmodelled(
+                        "of USART_CR3, DMA, flow control, smart cards, IrDA and half duplex are not modelled",
+                    );
                 }
             }
             0x18 => self.gtpr = value & 0xFFFF,
-            _ => return Err(Unmodelled("a USART has no such register".into())),
+            _ => return unmodelled("a USART has no such register"),
         }
         Ok(())
     }
@@ -525,12 +499,6 @@ mod tests {
         usart
     }
 
-    fn line(usart: &Usart) -> Vec<u16> {
-        let mut active = Vec::new();
-        usart.interrupts(&mut active);
-        active
-    }
-
     fn text(usart: &mut Usart) -> Vec<u8> {
         usart.take_sent().iter().map(|character| character.byte).collect()
     }
@@ -599,18 +567,18 @@ mod tests {
     #[test]
     fn interrupts_follow_flags_that_are_asked_for() {
         let mut usart = on(0);
-        assert!(line(&usart).is_empty());
+        assert!(usart.active().is_empty());
         for (enable, active) in [(1 << 7, true), (1 << 6, true), (1 << 5, false), (0, false)] {
             usart.write(CR1, 1 << 13 | 1 << 3 | 1 << 2 | enable, Time(0)).unwrap();
             // RM0090, table 61.
-            assert_eq!(line(&usart), if active { vec![38] } else { vec![] }, "{enable:x}");
+            assert_eq!(usart.active(), if active { vec![38] } else { vec![] }, "{enable:x}");
         }
         usart.write(CR1, 1 << 13 | 1 << 3 | 1 << 2 | 1 << 5, Time(0)).unwrap();
         usart.receive(b"x", Time(200 * MICRO));
         usart.advance(Time(400 * MICRO));
-        assert_eq!(line(&usart), [38]);
+        assert_eq!(usart.active(), [38]);
         assert_eq!(usart.read(DR, Time(400 * MICRO)), Ok(b'x'.into()));
-        assert!(line(&usart).is_empty());
+        assert!(usart.active().is_empty());
     }
 
     /// Section 30.3.3, overrun: the data register keeps its character, the new character is lost,
@@ -623,7 +591,7 @@ mod tests {
         usart.advance(late);
         assert_eq!(usart.waiting(), 0);
         assert_eq!(usart.read(DR, late), Ok(b'a'.into()));
-        assert_eq!(line(&usart), [38], "ORE interrupts as RXNE does");
+        assert_eq!(usart.active(), [38], "ORE interrupts as RXNE does");
         assert_eq!(usart.read(SR, late).unwrap() & 0x28, 0x08);
         assert_eq!(usart.read(DR, late), Ok(b'a'.into()));
         assert_eq!(usart.read(SR, late), Ok(0xC0));

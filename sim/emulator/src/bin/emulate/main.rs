@@ -210,17 +210,13 @@ fn main() -> ExitCode {
     match run(&Args::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         // The reader of the output has closed it.
-        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) if error.is::<Unheard>() => ExitCode::SUCCESS,
         Err(error) => {
             // If that cannot be written either, only the exit code reports it.
             let _ = writeln!(io::stderr(), "emulate: {error:#}");
             ExitCode::FAILURE
         }
     }
-}
-
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    error.downcast_ref::<Unheard>().is_some()
 }
 
 /// The reader of the output has closed it.

@@ -18,7 +18,7 @@
 use shared_abi::geometry::{Geometry, Line};
 
 use super::lock::Lock;
-use crate::peripheral::Unmodelled;
+use crate::peripheral::{unmodelled, Unmodelled};
 
 const KEYS: [u32; 2] = [0x0819_2A3B, 0x4C5D_6E7F];
 
@@ -92,11 +92,10 @@ impl OptionBytes {
     pub fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
         self.lock = self.lock.turn(value, KEYS);
         if self.lock == Lock::Barred {
-            return Err(Unmodelled(
+            return unmodelled(
                 "wrong key sequence at FLASH_OPTKEYR: FLASH_OPTCR is locked until the next reset, and the chip \
-                 answers with a bus error"
-                    .into(),
-            ));
+                 answers with a bus error",
+            );
         }
         Ok(())
     }
@@ -120,7 +119,7 @@ impl OptionBytes {
     /// The lock is shut.
     pub fn write_second(&mut self, value: u32) -> Result<(), Unmodelled> {
         if !self.lock.is_open() {
-            return Err(Unmodelled("FLASH_OPTCR1 is written while it is locked: the chip ignores it".into()));
+            return unmodelled("FLASH_OPTCR1 is written while it is locked: the chip ignores it");
         }
         self.register[1] = value & SECOND;
         Ok(())
@@ -132,18 +131,17 @@ impl OptionBytes {
     /// What the chip does not do, because of the lock or of read-out protection level 2.
     pub fn write(&mut self, value: u32) -> Result<Request, Unmodelled> {
         if !self.lock.is_open() {
-            return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
+            return unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it");
         }
         self.register[0] = value & self.kept;
         if value & OPTLOCK != 0 {
             self.lock = self.lock.close();
         } else if value & OPTSTRT != 0 {
             if self.level() == 2 {
-                return Err(Unmodelled(
+                return unmodelled(
                     "FLASH_OPTCR.OPTSTRT with read-out protection level 2: the option bytes cannot be changed any \
-                     more"
-                        .into(),
-                ));
+                     more",
+                );
             }
             if self.takes_protection_back() {
                 return Ok(Request::Protected);
@@ -392,9 +390,7 @@ mod tests {
         assert!(options.write_key(0x4C5D_6E7F).is_err());
         assert_eq!(options.read(false), 0x0FFF_AAED);
         options.reset();
-        options.write_key(0x0819_2A3B).unwrap();
-        options.write_key(0x4C5D_6E7F).unwrap();
-        assert_eq!(options.read(false), 0x0FFF_AAEC);
+        assert_eq!(opened(options).read(false), 0x0FFF_AAEC);
     }
 
     /// Section 3.6.3, figure 5: 0 to 1 and back with a mass erase; 2 is the end.

@@ -9,10 +9,24 @@ const SR: u32 = 0x0C;
 const CR: u32 = 0x10;
 const X32: u32 = 2 << 8;
 
-fn unlocked() -> Flash {
-    let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
+fn locked(chip: &'static Geometry) -> Flash {
+    Flash::new(chip, FlashTimes::Typical, TYPICAL)
+}
+
+fn unlock(mut flash: Flash) -> Flash {
     flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
     flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
+    flash
+}
+
+fn unlocked() -> Flash {
+    unlock(locked(&STM32F407VG))
+}
+
+/// The one with two banks; its array holds zeros.
+fn two_banks() -> Flash {
+    let mut flash = unlock(locked(&STM32F429ZI));
+    flash.array.bytes_mut().fill(0);
     flash
 }
 
@@ -81,10 +95,7 @@ fn times_lie_between_the_typical_and_the_worst_as_the_chip_is() {
         [(FlashTimes::Typical, 0, 250), (FlashTimes::Typical, 500, 375), (FlashTimes::Worst, 0, 500)]
     {
         let silicon = Silicon { flash_slowness_permille, ..TYPICAL };
-        let mut flash = Flash::new(&STM32F407VG, times, silicon);
-        for key in KEYS {
-            flash.write(KEYR, key, Time(0)).unwrap();
-        }
+        let mut flash = unlock(Flash::new(&STM32F407VG, times, silicon));
         flash.write(CR, CR_SER | X32 | CR_STRT, Time(0)).unwrap();
         assert_eq!(flash.next_event(), Some(Time(ms * 1_000_000_000)));
     }
@@ -115,20 +126,13 @@ fn sectors_of_the_second_bank_have_codes_of_their_own() {
         (0b01111, None),
         (0b11100, None),
     ] {
-        let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
-        flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
-        flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
-        flash.array.bytes_mut().fill(0);
+        let mut flash = two_banks();
         let result = flash.write(CR, CR_SER | code << 3 | X32 | CR_STRT, Time(0));
         flash.advance(Time(u64::MAX));
         assert_eq!(result.is_ok(), erased.is_some(), "{code:05b}");
         let erased = erased.unwrap_or(0..0);
-        let wrong = flash
-            .array
-            .bytes()
-            .iter()
-            .enumerate()
-            .position(|(at, &byte)| (byte == 0xFF) != erased.contains(&at));
+        let mut bytes = flash.array.bytes().iter().enumerate();
+        let wrong = bytes.position(|(at, &byte)| (byte == 0xFF) != erased.contains(&at));
         assert_eq!(wrong, None, "{code:05b}");
     }
 }
@@ -140,17 +144,10 @@ fn each_bank_has_its_own_write_protection() {
     for (optcr, optcr1, refused) in
         [(0x0FFF_AAEC_u32, 0x0FFE_0000, 0b10000), (0x0FFE_AAEC, 0x0FFF_0000, 0b00000)]
     {
-        let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
-        for (register, value) in [
-            (KEYR, 0x4567_0123),
-            (KEYR, 0xCDEF_89AB),
-            (0x08, 0x0819_2A3B), // OPTKEYR, OPTCR1, OPTCR with OPTSTRT
-            (0x08, 0x4C5D_6E7F),
-            (0x18, optcr1),
-            (0x14, optcr | 1 << 1),
-        ] {
-            flash.write(register, value, Time(0)).unwrap();
-        }
+        let mut flash = open_options(unlock(locked(&STM32F429ZI)));
+        // OPTCR1, OPTCR with OPTSTRT.
+        flash.write(0x18, optcr1, Time(0)).unwrap();
+        flash.write(OPTCR, optcr | 1 << 1, Time(0)).unwrap();
         let later = Time(1_000_000_000_000);
         flash.advance(later);
         assert_eq!(flash.read(0x18, later), Ok(optcr1));
@@ -170,10 +167,7 @@ fn a_mass_erase_is_one_of_a_bank() {
     for (bits, erased) in
         [(1 << 2, [true, false]), (1 << 15, [false, true]), (1 << 2 | 1 << 15, [true, true])]
     {
-        let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
-        flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
-        flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
-        flash.array.bytes_mut().fill(0);
+        let mut flash = two_banks();
         flash.write(CR, bits | X32 | CR_STRT, Time(0)).unwrap();
         flash.advance(Time(u64::MAX));
         for (bank, bytes) in flash.array.bytes().chunks(1 << 20).enumerate() {
@@ -185,7 +179,7 @@ fn a_mass_erase_is_one_of_a_bank() {
 
 #[test]
 fn a_wrong_key_locks_until_reset_with_a_bus_error() {
-    let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
+    let mut flash = locked(&STM32F407VG);
     flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
     assert!(flash.write(KEYR, 0, Time(0)).is_err());
     assert!(flash.take_bus_error());
@@ -193,9 +187,7 @@ fn a_wrong_key_locks_until_reset_with_a_bus_error() {
     let _ = flash.write(KEYR, 0xCDEF_89AB, Time(0));
     assert_eq!(flash.read(CR, Time(0)), Ok(0x8000_0000));
     flash.reset();
-    flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
-    flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
-    assert_eq!(flash.read(CR, Time(0)), Ok(0));
+    assert_eq!(unlock(flash).read(CR, Time(0)), Ok(0));
 }
 
 #[test]
@@ -217,9 +209,7 @@ fn each_refusal_has_its_flag() {
     flash.write(CR, CR_PG | X32 | CR_ERRIE, Time(0)).unwrap();
     flash.store(0, &word, Time(0));
     assert_eq!(status(&mut flash, Time(0)), 0x12, "WRPERR, and OPERR because of ERRIE");
-    let mut lines = Vec::new();
-    flash.interrupts(&mut lines);
-    assert_eq!(lines, [4]);
+    assert_eq!(flash.active(), [4]);
     assert!(flash.array.bytes().iter().all(|&byte| byte == 0xFF), "nothing was written");
 }
 
@@ -230,9 +220,7 @@ fn end_of_operation_shows_only_with_its_interrupt_enabled() {
     flash.store(0, &[0; 4], Time(0));
     flash.advance(Time(16_000_000));
     assert_eq!(status(&mut flash, Time(16_000_000)), 1);
-    let mut lines = Vec::new();
-    flash.interrupts(&mut lines);
-    assert_eq!(lines, [4]);
+    assert_eq!(flash.active(), [4]);
     flash.write(SR, 1, Time(16_000_000)).unwrap();
     assert_eq!(status(&mut flash, Time(16_000_000)), 0);
 }
@@ -249,18 +237,22 @@ fn a_write_while_busy_waits_for_the_end() {
 
 #[test]
 fn a_locked_register_does_not_change() {
-    let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
+    let mut flash = locked(&STM32F407VG);
     assert!(flash.write(CR, CR_PG, Time(0)).is_err());
     assert_eq!(flash.read(CR, Time(0)), Ok(CR_LOCK));
 }
 
 const OPTCR: u32 = 0x14;
 
-fn with_open_options() -> Flash {
-    let mut flash = unlocked();
+/// Writes the two keys into OPTKEYR.
+fn open_options(mut flash: Flash) -> Flash {
     flash.write(0x08, 0x0819_2A3B, Time(0)).unwrap();
     flash.write(0x08, 0x4C5D_6E7F, Time(0)).unwrap();
     flash
+}
+
+fn with_open_options() -> Flash {
+    open_options(unlocked())
 }
 
 /// RM0090 section 3.7.2: the register, then OPTSTRT, then BSY.
