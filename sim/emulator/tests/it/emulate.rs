@@ -5,10 +5,18 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use crate::assembler::assemble;
+use kit::assembler::assemble;
 
 fn emulate(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_emulate")).args(args).output().expect("the command starts")
+}
+
+/// What it prints when it succeeds.
+#[track_caller]
+fn prints(args: &[&str]) -> String {
+    let output = emulate(args);
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout).unwrap()
 }
 
 /// A folder of its own for each test.
@@ -23,7 +31,7 @@ fn program(folder: &Path, name: &str) -> String {
     let mut bytes = Vec::new();
     bytes.extend(0x2000_1000_u32.to_le_bytes());
     bytes.extend(0x0800_0009_u32.to_le_bytes());
-    bytes.extend(assemble(&format!("emulate/{name}.s"), 0x0800_0008).code);
+    bytes.extend(assemble(&format!("sim/emulator/tests/it/emulate/{name}.s"), 0x0800_0008).code);
     let path = folder.join("program.bin");
     std::fs::write(&path, bytes).unwrap();
     format!("{}@08000000", path.display())
@@ -36,23 +44,11 @@ fn runs_for_the_time_it_is_told() {
     let image = program(&folder, "forever");
     let args =
         ["--bootloader", &image, "--speed", "max", "--for", "0.25", "--trace", trace.to_str().unwrap()];
-    let output = emulate(&args);
-    let text = String::from_utf8(output.stdout).unwrap();
-    assert!(output.status.success(), "{text}");
+    let text = prints(&args);
     assert_eq!(text, "0.000000 board: power on\n0.250000 end: 0 frames, 0 error frames\n");
     assert_eq!(std::fs::read(trace).unwrap(), b"");
-    let output = emulate(&[
-        "--board",
-        "stm32f407g-disc1",
-        &image,
-        "--speed",
-        "max",
-        "--for",
-        "0.01",
-        "--node-count",
-        "2",
-    ]);
-    let text = String::from_utf8(output.stdout).unwrap();
+    let board = ["--board", "stm32f407g-disc1", &image, "--speed", "max", "--for", "0.01"];
+    let text = prints(&[&board[..], &["--node-count", "2"]].concat());
     assert!(text.contains("board 1: power on") && text.contains("board 2: power on"), "{text}");
 }
 
@@ -95,9 +91,7 @@ fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
 fn prints_the_chip_that_was_chosen() {
     let image = program(&folder("silicon"), "forever");
     let lines = |args: &[&str]| -> Vec<String> {
-        let output = emulate(&[&[&image, "--speed", "max", "--for", "0.01"], args].concat());
-        assert!(output.status.success(), "{output:?}");
-        let text = String::from_utf8(output.stdout).unwrap();
+        let text = prints(&[&[&image, "--speed", "max", "--for", "0.01"], args].concat());
         text.lines().filter(|line| line.contains("silicon")).map(str::to_owned).collect()
     };
     assert_eq!(lines(&[]), [""; 0]);
@@ -122,8 +116,7 @@ fn prints_the_chip_that_was_chosen() {
 #[test]
 fn says_what_is_not_modelled_with_address_and_program_counter() {
     let image = program(&folder("unmodelled"), "reads_can2");
-    let output = emulate(&[&image, "--speed", "max", "--for", "0.01"]);
-    let text = String::from_utf8(output.stdout).unwrap();
+    let text = prints(&[&image, "--speed", "max", "--for", "0.01"]);
     let line = text.lines().nth(1).unwrap_or_default();
     assert!(line.contains("read of 4 bytes at 40006800h, pc 0800000Ah"), "{text}");
     assert!(text.contains("board: 1 accesses, in 1 places"), "{text}");
@@ -331,8 +324,7 @@ fn the_flash_file_keeps_what_was_programmed() {
     let _ = std::fs::remove_file(&file);
     let path = file.to_str().unwrap();
     let image = program(&folder, "programs_a_byte");
-    let output = emulate(&[&image, "--flash", path, "--speed", "max", "--for", "0.01"]);
-    assert!(output.status.success(), "{output:?}");
+    prints(&[&image, "--flash", path, "--speed", "max", "--for", "0.01"]);
     let kept = std::fs::read(&file).unwrap();
     assert_eq!(kept.len(), 1 << 20);
     assert_eq!(kept[..4], 0x2000_1000_u32.to_le_bytes());
@@ -359,6 +351,14 @@ fn the_flash_file_keeps_what_was_programmed() {
     assert!(String::from_utf8(output.stderr).unwrap().contains("/nowhere/flash.bin cannot be written"));
 }
 
+/// A board with a debugger's port: its control socket, and the port's address.
+fn for_gdb(image: &str) -> (Running, Control, String) {
+    let mut board = Running::start(&[image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
+    let control = Control::connect(&board.after(COMMANDS_AT));
+    let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
+    (board, control, address)
+}
+
 /// The output of gdb.
 fn gdb(address: &str, commands: &[&str]) -> String {
     let mut gdb = Command::new("gdb-multiarch");
@@ -379,65 +379,46 @@ fn gdb(address: &str, commands: &[&str]) -> String {
 #[cfg(unix)]
 fn gdb_stops_steps_looks_and_changes() {
     let image = program(&folder("gdb"), "counts");
-    let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
-    let control = board.after(COMMANDS_AT);
-    let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
-    let said = gdb(
-        &address,
-        &[
-            "monitor reset",
-            "maintenance flush register-cache",
-            "p/x $pc",
-            "break *0x0800000c",
-            "continue",
-            "continue",
-            "p $r0",
-            "x/wx 0x20000000",
-            "delete",
-            "hbreak *0x08000016",
-            "continue",
-            "p/x $lr",
-            "stepi",
-            "p/x $pc",
-            "stepi",
-            "p/x $pc",
-            "set var $r0 = 1000",
-            "set var *(int*)0x20000010 = 0x12345678",
-            "x/wx 0x20000010",
-            "x/wx 0xe000ed00",
-            "delete",
-            "break *0x0800000c",
-            "continue",
-            "p $r0",
-            "monitor rubbish",
-            "detach",
-        ],
-    );
-    let mut rest = said.as_str();
-    for words in [
-        "halted at 08000008h",
-        "known command: reset",
-        "$1 = 0x8000008",
-        "Breakpoint 1, 0x0800000c",
-        "Breakpoint 1, 0x0800000c",
-        "$2 = 1",
-        "0x20000000:\t0x00000001",
-        "Breakpoint 2, 0x08000016",
-        "$3 = 0x8000015",
-        "$4 = 0x8000018",
-        "$5 = 0x8000014",
-        "0x20000010:\t0x12345678",
+    let (mut board, mut control, address) = for_gdb(&image);
+    // Commands, and what they print.
+    let steps = [
+        ("monitor reset", ""),
+        ("maintenance flush register-cache", ""),
+        ("p/x $pc", "$1 = 0x8000008"),
+        ("break *0x0800000c", ""),
+        ("continue", "Breakpoint 1, 0x0800000c"),
+        ("continue", "Breakpoint 1, 0x0800000c"),
+        ("p $r0", "$2 = 1"),
+        ("x/wx 0x20000000", "0x20000000:\t0x00000001"),
+        ("delete", ""),
+        ("hbreak *0x08000016", ""),
+        ("continue", "Breakpoint 2, 0x08000016"),
+        ("p/x $lr", "$3 = 0x8000015"),
+        ("stepi", ""),
+        ("p/x $pc", "$4 = 0x8000018"),
+        ("stepi", ""),
+        ("p/x $pc", "$5 = 0x8000014"),
+        ("set var $r0 = 1000", ""),
+        ("set var *(int*)0x20000010 = 0x12345678", ""),
+        ("x/wx 0x20000010", "0x20000010:\t0x12345678"),
         // CPUID of the Cortex-M4 r0p1 (PM0214 section 4.4.2).
-        "0xe000ed00:\t0x410fc241",
-        "Breakpoint 3, 0x0800000c",
-        "$6 = 1000",
-        "detached",
-    ] {
+        ("x/wx 0xe000ed00", "0xe000ed00:\t0x410fc241"),
+        ("delete", ""),
+        ("break *0x0800000c", ""),
+        ("continue", "Breakpoint 3, 0x0800000c"),
+        ("p $r0", "$6 = 1000"),
+        ("monitor rubbish", ""),
+        ("detach", "detached"),
+    ];
+    let said = gdb(&address, &steps.map(|(command, _)| command));
+    // The answers to `monitor` come first.
+    let answers = ["halted at 08000008h", "known command: reset"];
+    let mut rest = said.as_str();
+    for words in answers.into_iter().chain(steps.map(|(_, words)| words)) {
         let at =
             rest.find(words).unwrap_or_else(|| panic!("{words:?} is missing behind {rest:?} in\n{said}"));
         rest = &rest[at + words.len()..];
     }
-    let mut control = Control::connect(&control);
     assert!(control.ask(b"status\n").contains("board: runs"), "it goes on without its debugger");
     board.interrupt();
 }
@@ -451,10 +432,7 @@ const NOISE: &[u8] = b"$#+-cmMgGsXZzvqk,;:0123456789abcdef\x03\xFF}*";
 #[cfg(unix)]
 fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
     let image = program(&folder("gdb-rubbish"), "counts");
-    let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
-    let control = board.after(COMMANDS_AT);
-    let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
-    let mut control = Control::connect(&control);
+    let (mut board, mut control, address) = for_gdb(&image);
     let mut door = TcpStream::connect(&address).unwrap();
     board.line_with("time stands still");
     let status = control.ask(b"status\n");

@@ -58,6 +58,20 @@ fn machine(program: &Program) -> Machine {
     with_options(program, Options::default())
 }
 
+/// The same at this time.
+fn ran(program: &Program, until: Time) -> Machine {
+    let mut machine = machine(program);
+    machine.run_until(until);
+    machine
+}
+
+/// The machine with `argument` at [`ARGUMENT`].
+fn with_argument(program: &Program, argument: u32) -> Machine {
+    let mut machine = machine(program);
+    put(&mut machine, ARGUMENT, argument);
+    machine
+}
+
 /// A machine that is about to run the program in RAM, with `argument` at [`ARGUMENT`].
 fn machine_in_ram(program: &Program, argument: u32, options: Options) -> Machine {
     let mut machine = with_options(&programs::TO_RAM, options);
@@ -82,7 +96,6 @@ fn put(machine: &mut Machine, address: u32, value: u32) {
 }
 
 // --- start and time
-// --------------------------------------------------------------------------------------------------
 
 #[test]
 fn reset_fetches_stack_pointer_and_entry_and_wfi_costs_nothing() {
@@ -112,8 +125,7 @@ fn without_a_program_the_chip_locks_up() {
 
 #[test]
 fn systick_comes_once_a_millisecond() {
-    let mut machine = machine(&programs::SYSTICK);
-    machine.run_until(Time(100 * MS + MS / 2));
+    let mut machine = ran(&programs::SYSTICK, Time(100 * MS + MS / 2));
     assert_eq!(words(&machine, 2), [100, 100]);
     assert_eq!(machine.counters().exceptions[15], 100);
     machine.run_until(Time(1_000 * MS + MS / 2));
@@ -188,8 +200,7 @@ fn ram_is_noise_at_power_on_and_kept_over_a_reset() {
 /// starts it (ARMv7-M B3.3.1).
 #[test]
 fn time_passes_inside_a_straight_run_of_code() {
-    let mut machine = machine(&programs::TIME_IN_A_BLOCK);
-    machine.run_until(ms(1));
+    let machine = ran(&programs::TIME_IN_A_BLOCK, ms(1));
     let [distance, count, first, second, border] = words(&machine, 5)[..] else { panic!() };
     assert_eq!([distance, count], [100, 10]);
     assert!((979..=981).contains(&first), "{first}: 1000 is loaded, and 20 instructions passed");
@@ -215,13 +226,11 @@ fn code_costs_what_the_manuals_say_if_it_is_asked_for() {
 }
 
 // --- timers and pins
-// -------------------------------------------------------------------------------------------------
 
 /// 1 s of microseconds has 15 overflows of 65 536 and 15 times its middle. RM0090 section 18.3.2.
 #[test]
 fn a_timer_interrupts_at_halves_of_its_range_and_the_cpu_sleeps_between() {
-    let mut machine = machine(&programs::TIMER_HALVES);
-    machine.run_until(Time(1_000 * MS));
+    let machine = ran(&programs::TIMER_HALVES, Time(1_000 * MS));
     assert_eq!(words(&machine, 2), [15, 15]);
     assert_eq!(machine.counters().exceptions[45], 30);
     assert!(machine.counters().instructions < 30 * 20 + 40, "{}", machine.counters().instructions);
@@ -231,8 +240,7 @@ fn a_timer_interrupts_at_halves_of_its_range_and_the_cpu_sleeps_between() {
 /// A write to a register in the block in which the period ends does not put the interrupt off.
 #[test]
 fn no_period_of_a_timer_is_lost_while_the_program_writes_registers() {
-    let mut machine = machine(&programs::TIMER_PERIOD);
-    machine.run_until(Time(200 * MS + MS / 2));
+    let mut machine = ran(&programs::TIMER_PERIOD, Time(200 * MS + MS / 2));
     assert_eq!(word(&machine, OUT), 200);
     let latency = word(&machine, OUT + 4);
     assert!(latency < 60, "the interrupt comes a block late at most: {latency} cycles");
@@ -351,7 +359,6 @@ fn a_falling_edge_at_a_pin_wakes_the_program() {
 }
 
 // --- exceptions
-// ------------------------------------------------------------------------------------------------------
 
 /// DDI 0403E table B1-8: EXC_RETURN FFFF_FFF1 to a handler, FFFF_FFF9 to the thread on the main
 /// stack.
@@ -362,8 +369,7 @@ fn a_higher_priority_pre_empts_and_an_equal_one_waits_and_follows() {
         (0x40, [1, 0xFFFF_FFF9, 2, 0xFFFF_FFF1, nested_sp, 3, 4]),
         (0x80, [1, 0xFFFF_FFF9, 3, 2, 0xFFFF_FFF9, STACK - 0x20, 4]),
     ] {
-        let mut machine = machine(&programs::NESTING);
-        put(&mut machine, ARGUMENT, priority);
+        let mut machine = with_argument(&programs::NESTING, priority);
         machine.run_until(ms(1));
         assert_eq!(words(&machine, 7), log, "{priority:02X}h");
         assert_eq!(machine.counters().exceptions[16..18], [1, 1], "{priority:02X}h");
@@ -399,8 +405,7 @@ fn a_program_finds_what_the_manuals_say() {
 /// stacked xPSR.
 #[test]
 fn svc_from_the_process_stack_and_back() {
-    let mut machine = machine(&programs::PROCESS_STACK);
-    machine.run_until(ms(1));
+    let machine = ran(&programs::PROCESS_STACK, ms(1));
     let log = words(&machine, 9);
     assert_eq!(log[0], 0xFFFF_FFFD);
     assert_eq!(log[1], STACK, "the handler's own stack is the main one");
@@ -414,11 +419,9 @@ fn svc_from_the_process_stack_and_back() {
 
 #[test]
 fn wfe_ends_by_itself_and_sleep_on_exit_never_comes_back() {
-    let mut waiting = machine(&programs::EVENTS);
-    waiting.run_until(ms(1));
+    let waiting = ran(&programs::EVENTS, ms(1));
     assert!((50..=100).contains(&word(&waiting, OUT)), "{}", word(&waiting, OUT));
-    let mut sleeping = machine(&programs::SLEEPS_ON_EXIT);
-    sleeping.run_until(Time(10 * MS + MS / 2));
+    let sleeping = ran(&programs::SLEEPS_ON_EXIT, Time(10 * MS + MS / 2));
     assert_eq!(words(&sleeping, 2), [10, 0]);
 }
 
@@ -445,12 +448,10 @@ fn code_that_was_read_before_it_was_run_can_be_replaced() {
 }
 
 // --- FPU
-// -------------------------------------------------------------------------------------------------------------
 
 #[test]
 fn the_fpu_faults_until_it_is_enabled() {
-    let mut machine = machine(&programs::FPU);
-    put(&mut machine, ARGUMENT, 0);
+    let mut machine = with_argument(&programs::FPU, 0);
     machine.run_until(ms(1));
     let [cfsr, hfsr] = [0xE000_ED28, 0xE000_ED2C].map(|register| machine.register(register));
     assert_eq!((cfsr, hfsr), (Some(0x0008_0000), Some(FORCED)), "NOCP, FORCED");
@@ -462,8 +463,7 @@ fn the_fpu_faults_until_it_is_enabled() {
 /// DDI 0403E B1.5.7: the extended frame has 26 words, EXC_RETURN has bit 4 clear.
 #[test]
 fn fpu_registers_survive_an_interrupt() {
-    let mut machine = machine(&programs::FPU);
-    put(&mut machine, ARGUMENT, 1);
+    let mut machine = with_argument(&programs::FPU, 1);
     machine.run_until(ms(1));
     assert_eq!(word(&machine, OUT), 0xFFFF_FFE9);
     assert_eq!(word(&machine, OUT + 4), 3.0_f32.to_bits());
@@ -471,13 +471,11 @@ fn fpu_registers_survive_an_interrupt() {
 }
 
 // --- faults
-// ----------------------------------------------------------------------------------------------------------
 
 /// Runs [`programs::FAULTS`] with this kind of fault. It logs IPSR, CFSR, HFSR, BFAR and the
 /// stacked PC.
 fn fault(kind: u32, enabled: u32, again: u32) -> (Machine, Stop) {
-    let mut machine = machine(&programs::FAULTS);
-    put(&mut machine, ARGUMENT, kind);
+    let mut machine = with_argument(&programs::FAULTS, kind);
     put(&mut machine, ARGUMENT + 4, enabled);
     put(&mut machine, ARGUMENT + 8, again);
     let stop = machine.run_until(ms(1));
@@ -541,7 +539,6 @@ fn code_runs_in_ram_but_not_in_core_coupled_memory() {
 }
 
 // --- reset causes
-// ----------------------------------------------------------------------------------------------------
 
 /// RM0090 section 7.3.21: RCC_CSR reset flags.
 #[test]
@@ -561,14 +558,12 @@ fn a_software_reset_keeps_ram_and_says_so() {
 
 #[test]
 fn the_watchdog_resets_unless_it_is_fed() {
-    let mut hungry = machine(&programs::WATCHDOG);
-    put(&mut hungry, ARGUMENT, 0);
+    let mut hungry = with_argument(&programs::WATCHDOG, 0);
     assert_eq!(hungry.run_until(ms(10)), Stop::Reset(ResetCause::IndependentWatchdog));
     // Five periods of 32 kHz until the values have got across, then the millisecond.
     let (at, across) = (hungry.now().0, 5 * MS / 32);
     assert!((across + MS..across + MS + MS / 50).contains(&at), "{}", hungry.now());
-    let mut fed = machine(&programs::WATCHDOG);
-    put(&mut fed, ARGUMENT, 10);
+    let mut fed = with_argument(&programs::WATCHDOG, 10);
     assert_eq!(fed.run_until(ms(30)), Stop::Reset(ResetCause::IndependentWatchdog));
     // Ten rounds of 6 400 × 2 cycles at 16 MHz, 0.8 ms each, then the millisecond that is not fed.
     assert!((across + 9 * MS..across + 9 * MS + MS / 10).contains(&fed.now().0), "{}", fed.now());
@@ -609,8 +604,7 @@ fn a_chip_wakes_up_from_standby_by_the_pin_or_by_a_reset() {
 /// PM0214 section 3.11.12: WFI ends when an interrupt is pending, whatever PRIMASK says.
 #[test]
 fn a_pending_interrupt_keeps_the_chip_out_of_standby() {
-    let mut machine = machine(&programs::STANDBY);
-    put(&mut machine, ARGUMENT, 2);
+    let mut machine = with_argument(&programs::STANDBY, 2);
     assert_eq!(machine.run_until(ms(10)), Stop::Deadline);
     assert!(!machine.is_in_standby());
     assert_eq!(machine.register(0x4000_7004), Some(0x4100), "EWUP, no SBF");
@@ -619,8 +613,7 @@ fn a_pending_interrupt_keeps_the_chip_out_of_standby() {
 /// RM0090 sections 5.3.5 and 21.3: in Standby the core domain stands still, and the watchdog runs on.
 #[test]
 fn the_watchdog_bites_in_standby() {
-    let mut machine = machine(&programs::STANDBY);
-    put(&mut machine, ARGUMENT, 1);
+    let mut machine = with_argument(&programs::STANDBY, 1);
     assert_eq!(machine.run_until(ms(600)), Stop::Reset(ResetCause::IndependentWatchdog));
     let at = machine.now().0;
     assert!((512 * MS..513 * MS).contains(&at), "{}", machine.now());
@@ -634,8 +627,7 @@ fn the_watchdog_bites_in_standby() {
 #[test]
 fn a_timer_without_a_clock_in_sleep_mode_stands_still() {
     for (apb1lpenr, overflows) in [(0x36FE_C9FF, 99..=100), (0x36FE_C9FE, 0..=0)] {
-        let mut machine = machine(&programs::SLEEPS_WITH_A_TIMER);
-        put(&mut machine, ARGUMENT, apb1lpenr);
+        let mut machine = with_argument(&programs::SLEEPS_WITH_A_TIMER, apb1lpenr);
         assert_eq!(machine.run_until(ms(100) + Span::from_micros(10)), Stop::Deadline);
         let counted = words(&machine, 2);
         assert!(overflows.contains(&counted[0]), "{apb1lpenr:08X}h: {counted:?}");
@@ -662,14 +654,12 @@ fn systick_begins_with_what_the_chip_has() {
 }
 
 // --- clocks
-// ----------------------------------------------------------------------------------------------------------
 
 /// 2 ms for the crystal and 0.2 ms for the PLL pass before; 168 MHz / 16 800 makes a tick each 100
 /// µs.
 #[test]
 fn the_program_sets_the_clock_and_the_cycles_follow() {
-    let mut machine = machine(&programs::SCALES_THE_CLOCK);
-    put(&mut machine, ARGUMENT, 5);
+    let mut machine = with_argument(&programs::SCALES_THE_CLOCK, 5);
     machine.run_until(ms(2));
     assert_eq!(machine.core_clock(), 16_000_000);
     machine.run_until(ms(3));
@@ -686,8 +676,7 @@ fn the_program_sets_the_clock_and_the_cycles_follow() {
 
 #[test]
 fn too_few_wait_states_are_reported() {
-    let mut machine = machine(&programs::SCALES_THE_CLOCK);
-    put(&mut machine, ARGUMENT, 4);
+    let mut machine = with_argument(&programs::SCALES_THE_CLOCK, 4);
     machine.run_until(ms(20));
     assert!(machine.reports()[0].what.contains("4 flash wait states: it needs 5"), "{:?}", machine.reports());
 }
@@ -702,7 +691,6 @@ fn without_its_crystal_the_board_never_gets_there() {
 }
 
 // --- memory map
-// ------------------------------------------------------------------------------------------------------
 
 #[test]
 fn unmodelled_and_unclocked_accesses_are_reported_once_with_a_count() {
@@ -778,8 +766,7 @@ fn where_in_ram_a_piece_of_code_goes_is_told() {
 
 #[test]
 fn the_host_may_write_into_the_ccm_while_a_program_runs() {
-    let mut machine = machine(&programs::STORES_AND_SLEEPS);
-    machine.run_until(ms(1));
+    let mut machine = ran(&programs::STORES_AND_SLEEPS, ms(1));
     machine.write_ram(0x1000_0000, &[0xA5; 64]).unwrap();
     assert_eq!(machine.run_until(ms(2)), Stop::Deadline);
     assert_eq!(machine.reports(), []);
@@ -787,7 +774,6 @@ fn the_host_may_write_into_the_ccm_while_a_program_runs() {
 }
 
 // --- hostile input
-// ---------------------------------------------------------------------------------------------------
 
 #[test]
 fn bad_images_are_refused_and_leave_the_flash_alone() {
@@ -858,7 +844,6 @@ fn noise_as_a_program_does_no_harm() {
 }
 
 // --- resets by the chip itself
-// -----------------------------------------------------------------------------------------------
 
 /// RM0090 sections 7.1.1 and 7.3.21: with nRST_STDBY or nRST_STOP clear, the entry is a reset with
 /// LPWRRSTF, and the pin's flag as with every internal reset.
@@ -883,8 +868,7 @@ fn with_an_option_bit_the_entry_into_standby_is_a_reset() {
 /// WWDGRSTF, and the flags of the power-on.
 #[test]
 fn the_window_watchdog_resets_the_chip() {
-    let mut machine = machine(&programs::BUSY);
-    machine.run_until(ms(1));
+    let mut machine = ran(&programs::BUSY, ms(1));
     for (register, value) in [(0x4002_3840_u32, 1_u32 << 11), (0x4000_2C00, 0xFF)] {
         machine.poke(register, &value.to_le_bytes()).unwrap();
     }

@@ -10,9 +10,8 @@ use std::{env, fs, thread};
 
 use emulator::machine::{Machine, Options};
 use emulator::time::Time;
+use kit::assembler::{assemble, Assembled};
 use shared_abi::geometry::STM32F407VG;
-
-use crate::assembler::{assemble, Assembled};
 
 const STACK: u32 = 0x2001_0000;
 /// Where the programs write.
@@ -212,13 +211,12 @@ const PROGRAMS: &[Program] = &[
 ];
 
 // --- the programs, assembled
-// -------------------------------------------------------------------------------------------------
 
 struct Image(Assembled);
 
 impl Image {
     fn build() -> Self {
-        Self(assemble("second_opinion/programs.s", CODE))
+        Self(assemble("sim/emulator/tests/it/second_opinion/programs.s", CODE))
     }
 
     fn symbol(&self, name: &str) -> u32 {
@@ -235,7 +233,6 @@ fn words(bytes: &[u8]) -> Vec<u32> {
 }
 
 // --- the machines
-// -------------------------------------------------------------------------------------------------
 
 fn ours(image: &Image, name: &str) -> Vec<u32> {
     let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
@@ -285,7 +282,6 @@ fn qemu(image: &Image, name: &str) -> Result<Vec<u32>, String> {
 }
 
 // --- the comparisons
-// -------------------------------------------------------------------------------------------------
 
 impl Program {
     /// How many words it writes.

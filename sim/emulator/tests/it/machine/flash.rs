@@ -79,6 +79,11 @@ fn a_load_from_busy_flash_stalls_code_in_ram() {
     assert_eq!(machine.counters().flash_stalls, 1);
 }
 
+/// Whether the caches keep lines that have become stale.
+fn keeping(stale_lines: bool) -> Options {
+    Options { silicon: Silicon { stale_lines, ..TYPICAL }, ..Options::default() }
+}
+
 /// RM0090 section 3.6.4, programming and caches: a store writes through the data cache, an erase does not reach
 /// it, and DCRST empties it. With the cache off, or on a chip that drops such lines, the array is read.
 #[test]
@@ -87,8 +92,7 @@ fn a_load_by_the_data_cache_is_stale_after_an_erase_until_the_flush() {
     const NEW: u32 = 0x1234_5678;
     const BLANK: u32 = u32::MAX;
     let run = |stale_lines, acr| {
-        let silicon = Silicon { stale_lines, ..TYPICAL };
-        let options = Options { silicon, ..Options::default() };
+        let options = keeping(stale_lines);
         let mut machine = machine_in_ram(&programs::LOADS_BY_THE_CACHE, acr, options);
         machine.load_bin(0x0800_4000, &OLD.to_le_bytes().repeat(8)).unwrap();
         machine.run_until(ms(300));
@@ -110,8 +114,7 @@ fn a_fetch_of_code_that_was_erased_after_it_ran_is_reported_until_the_flush() {
     const ICEN: u32 = 1 << 9;
     const OTHERS: u32 = 1 << 10 | 1 << 8;
     let run = |stale_lines, acr, flushes| {
-        let silicon = Silicon { stale_lines, ..TYPICAL };
-        let options = Options { silicon, ..Options::default() };
+        let options = keeping(stale_lines);
         let mut machine = machine_in_ram(&programs::RUNS_BY_THE_CACHE, acr, options);
         put(&mut machine, ARGUMENT + 4, flushes);
         // movs r0, #1; bx lr
@@ -217,13 +220,16 @@ pub(super) struct Stored {
     bfar: u32,
 }
 
-/// Runs a script of stores on a machine that has come out of a reset.
-pub(super) fn store(machine: &mut Machine, script: &[&[(u32, u32)]]) -> Stored {
-    let script = script.concat();
+fn write_script(machine: &mut Machine, script: &[(u32, u32)]) {
     for (n, (address, value)) in (0..).zip(script.iter().chain(&[(0, 0)])) {
         put(machine, ARGUMENT + 8 * n, *address);
         put(machine, ARGUMENT + 8 * n + 4, *value);
     }
+}
+
+/// Runs a script of stores on a machine that has come out of a reset.
+pub(super) fn store(machine: &mut Machine, script: &[&[(u32, u32)]]) -> Stored {
+    write_script(machine, &script.concat());
     let until = Time(machine.now().0 + MS);
     assert_eq!(machine.run_until(until), Stop::Deadline);
     let log = words(machine, 6);
@@ -317,10 +323,7 @@ fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {
 #[test]
 fn a_precise_fault_under_faultmask_locks_up_otherwise() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
-    for (n, (address, value)) in (0..).zip([NO_WRITE_BUFFER, CPSID_F, LOCK[0], (0, 0)]) {
-        put(&mut machine, ARGUMENT + 8 * n, address);
-        put(&mut machine, ARGUMENT + 8 * n + 4, value);
-    }
+    write_script(&mut machine, &[NO_WRITE_BUFFER, CPSID_F, LOCK[0]]);
     assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
 }
 

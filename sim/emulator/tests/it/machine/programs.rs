@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use crate::assembler::assemble;
+use kit::assembler::assemble;
 
 /// A program: its code, where that lies, and the exception handlers by exception number.
 pub struct Program {
@@ -17,7 +17,8 @@ pub struct Program {
 impl Program {
     fn assembled(name: &str) -> Self {
         const FLASH: u32 = 0x0800_0200;
-        let assembled = assemble(&format!("machine/programs/{}.s", name.to_lowercase()), FLASH);
+        const PLACE: &str = "sim/emulator/tests/it/machine/programs";
+        let assembled = assemble(&format!("{PLACE}/{}.s", name.to_lowercase()), FLASH);
         let words = assembled.vectors.chunks_exact(4);
         let words: Vec<_> = words.map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect();
         Self {
