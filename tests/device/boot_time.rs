@@ -81,8 +81,7 @@ fn starts(bench: &mut Bench, set: impl Fn(&mut Bench)) -> [Span; 4] {
     bench.run_ms(10);
     let stays = press(bench.machine(), true);
     let from = bench.time();
-    bench.power_on();
-    let power_on = bench.await_boot_up(100) - from;
+    let power_on = bench.switch_on() - from;
     press(bench.machine(), false);
     // A board without the strap has started its program.
     if stays {
@@ -139,8 +138,7 @@ fn the_boot_up_waits_for_a_late_crystal_and_for_none_at_all_a_bounded_time() {
     for crystal_start_us in [300, 2_000, 10_000, 20_000] {
         let silicon = Silicon { crystal_start_us, ..TYPICAL };
         let mut bench = Bench::with(ChipOptions { silicon, ..ChipOptions::default() });
-        bench.power_on();
-        let took = micros(bench.await_boot_up(100) - Time(0));
+        let took = micros(bench.switch_on() - Time(0));
         println!("crystal after {crystal_start_us} us: boot-up {took} us after power-on");
         assert!(took <= u64::from(crystal_start_us) + REST_US, "{took} us");
     }
@@ -148,8 +146,7 @@ fn the_boot_up_waits_for_a_late_crystal_and_for_none_at_all_a_bounded_time() {
     for silicon in [TYPICAL, Silicon { hsi_hz: TYPICAL.hsi_hz, ..emulator::silicon::WORST }] {
         let chip = ChipOptions { hse_hz: 0, silicon, ..ChipOptions::default() };
         let mut bench = Bench::of_image_with(firmware::BOOTLOADER_LEAST, chip);
-        bench.power_on();
-        let took = micros(bench.await_boot_up(100) - Time(0));
+        let took = micros(bench.switch_on() - Time(0));
         println!("no crystal: boot-up {took} us after power-on, {silicon}");
         assert!((20_000..=50_000 + REST_US).contains(&took), "{took} us");
     }

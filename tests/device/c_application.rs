@@ -212,7 +212,7 @@ fn it_can_be_called_back_at_every_bit_rate() {
         // One bit rate is enough for this.
         if rate == BitRate::K1000 {
             install(&mut bench, firmware::APP_V2);
-            assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
+            assert_eq!(bench.text(0x100A), "2.0.0");
         }
     });
 }

@@ -512,7 +512,6 @@ fn a_stopped_program_can_be_reset_and_called_back() {
 }
 
 // --- coflash
-// ---------------------------------------------------------------------------------------------------------
 
 /// The library: the functions of `coflash more debug`, in virtual time.
 #[test]

@@ -135,9 +135,7 @@ fn the_entry_strap_holds_the_device_in_the_bootloader() {
     bench.switch_on();
     assert!(bench.is_bootloader(NODE));
     press(bench.machine(), false);
-    bench.power_off();
-    bench.power_on();
-    bench.await_program(1000);
+    bench.restart();
     assert!(!bench.is_bootloader(NODE));
 }
 

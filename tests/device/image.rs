@@ -235,7 +235,6 @@ fn gdb_loads_it_and_finds_symbols_in_ram() {
 }
 
 // --- on the emulated board
-// -------------------------------------------------------------------------------------------------
 
 /// A board with version 1 of the application, switched off.
 fn board_with_a_program() -> Bench {

@@ -63,7 +63,7 @@ fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
     bench.await_boot_up(1000);
     bench.run_ms(50);
     assert!(!bench.is_bootloader(NODE), "{what}: it does not start");
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), version, "{what}");
+    assert_eq!(bench.text(0x100A), version, "{what}");
     bench.session().command(1, ProgramControl::Stop).unwrap();
     bench.run_ms(100);
     assert!(bench.is_bootloader(NODE), "{what}");
@@ -93,7 +93,7 @@ fn coflash_sends_a_sealed_image_in_blocks() {
     let file = SealedFile::parse(seal(&sealer(COUNTER), firmware::APP_V2)).unwrap();
     let options = FlashOptions::default().blocks(Some(512));
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(bench.text(0x100A), "2.0.0");
     bench.assert_nothing_unmodelled();
 }
 
@@ -266,7 +266,7 @@ fn coflash_goes_on_with_a_sealed_image_in_blocks() {
     })
     .unwrap();
     assert_eq!(went_on_with, Some(19 * (512 - 16)));
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(bench.text(0x100A), "2.0.0");
 }
 
 /// Eight devices on one bus get an image in one download for all.

@@ -5,15 +5,11 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, seal, sealer, COUNTER, KEKS};
 use coflash_core::file::sealed::Sealer;
-
-/// 100Ah, software version.
-const VERSION: Address = Address::new(0x100A, 0);
 
 /// How many times slower than real time the board runs for a client with its own time-out, and how many
 /// times longer that time-out is: their ratio stays, and a busy host has time enough.
@@ -45,7 +41,7 @@ fn an_unmodified_python_canopen_writes_a_sealed_image() {
         assert!(text.contains(said), "{way:?}: {text}");
         if said == "started" {
             assert!(output.status.success(), "{text}");
-            assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+            assert_eq!(endpoint.bench.text(0x100A), "1.0.0");
             endpoint.bench.session().command(1, ProgramControl::Stop).unwrap();
             endpoint.bench.run_ms(100);
         }
@@ -65,7 +61,7 @@ fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
     let said = [output.stdout, output.stderr].concat();
     let said = String::from_utf8_lossy(&said);
     assert!(output.status.success() && said.contains("started\n"), "{said}");
-    assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), "1.0.0");
+    assert_eq!(endpoint.bench.text(0x100A), "1.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }
 

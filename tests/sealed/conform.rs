@@ -14,8 +14,7 @@ fn sealed_devices_pass() {
     let unsealed = ["REN-010", "REN-011"];
     for (what, mut bench, and) in [("with keys", board(), &unsealed[..]), ("without keys", open_board(), &[])]
     {
-        bench.power_on();
-        bench.await_boot_up(100);
+        bench.switch_on();
         let harmless: Vec<_> = checks().into_iter().filter(|check| !check.installs).collect();
         let (mut failed, mut skipped) = (Vec::new(), Vec::new());
         let means = Means::of(Duration::from_millis(500));

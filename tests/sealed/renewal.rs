@@ -132,8 +132,7 @@ fn an_image_that_was_only_staged_raises_no_counter() {
     bench.power_off();
     let home = firmware::board().home.unwrap().base;
     bench.machine().load_bin(home, &image(0, 0x0000_9000)).unwrap();
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     assert_eq!((running(&mut bench), progress(&mut bench).state), (0x0000_9000, State::None));
     assert_eq!(send(&mut bench, &sealed(1, 0x0001_0000)), status::ROLLBACK);
     assert_eq!(send(&mut bench, &second), status::OK);

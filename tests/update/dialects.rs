@@ -84,7 +84,7 @@ fn a_lift_tool() {
     assert_eq!(session.read_text(VERSION).unwrap(), "2.0.0", "100Ah is the stored image's");
     session.command(1, ProgramControl::ResetStat).unwrap();
     bench.await_boot_up_of(NODE, 2000);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+    assert_eq!(bench.text(0x100A), "2.0.0");
 
     // The parameters survive all of this.
     unlock(&mut bench, NODE);

@@ -36,9 +36,13 @@ fn one_by_one() -> ManyOptions {
 fn assert_all_have(fleet: &mut Fleet, devices: u8, crc: u32) {
     for node in 1..=devices {
         assert!(!fleet.bench.is_bootloader(node), "node {node}");
-        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
-        assert_eq!(told.unwrap(), crc, "node {node}");
+        assert_eq!(program(fleet, node), crc, "node {node}");
     }
+}
+
+/// 1F56h/1 of a device.
+fn program(fleet: &mut Fleet, node: u8) -> u32 {
+    fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1)).unwrap()
 }
 
 fn together(update: &Update, device: usize) -> Option<usize> {
@@ -224,26 +228,29 @@ fn a_cancelled_group_goes_on_later() {
     assert_all_have(&mut fleet, 3, file.crc());
 }
 
-/// One of three boards cannot take the program: the error is its own, and the others have theirs.
-fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>) -> Error {
+/// Three boards of which the second is prepared, and their update; the others stay together.
+fn with_another(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>) -> (Fleet, Update) {
     let mut fleet = Fleet::new(3, BitRate::K1000);
     let board = fleet.bench.boards()[1];
     fleet.bench.world.power_off(board);
     prepare(fleet.bench.world.machine_mut(board));
     fleet.bench.world.power_on(board);
     fleet.bench.run_ms(50);
-    let mut update = fleet.update(3, file, &ManyOptions::default());
-    assert_eq!(update.done(), 2, "{:?}", update.results);
+    let update = fleet.update(3, file, &ManyOptions::default());
     assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
-    let crc = file.crc();
+    (fleet, update)
+}
+
+/// One of three boards cannot take the program: the error is its own, and the others have theirs.
+fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>) -> Error {
+    let (mut fleet, mut update) = with_another(prepare, file);
+    assert_eq!(update.done(), 2, "{:?}", update.results);
     for node in [1, 3] {
-        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
-        assert_eq!(told.unwrap(), crc, "node {node}");
+        assert_eq!(program(&mut fleet, node), file.crc(), "node {node}");
     }
     // It runs nothing that was not verified, and is there for the next try.
     assert!(fleet.bench.is_bootloader(2));
-    let told = fleet.bench.session_with(2).read_number(Address::new(PROGRAM_ID, 1)).unwrap();
-    assert_eq!(told, 0);
+    assert_eq!(program(&mut fleet, 2), 0);
     update.results.swap_remove(1).unwrap_err().error
 }
 
@@ -251,20 +258,13 @@ fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>)
 #[test]
 fn a_device_with_another_checksum_is_updated_alone() {
     let file = file(KIB);
-    let mut fleet = Fleet::new(3, BitRate::K1000);
-    let board = fleet.bench.boards()[1];
-    fleet.bench.world.power_off(board);
-    fleet.bench.world.machine_mut(board).load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap();
-    fleet.bench.world.power_on(board);
-    fleet.bench.run_ms(50);
-    let update = fleet.update(3, &file, &ManyOptions::default());
+    let (mut fleet, update) =
+        with_another(|machine| machine.load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap(), &file);
     assert_eq!(update.done(), 3, "{:?}", update.results);
-    assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
-    let program: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes.into_owned()).collect();
-    for (node, crc) in [(1, file.crc()), (2, kit::bench::crc16(&program)), (3, file.crc())] {
+    let bytes: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes.into_owned()).collect();
+    for (node, crc) in [(1, file.crc()), (2, kit::bench::crc16(&bytes)), (3, file.crc())] {
         assert!(!fleet.bench.is_bootloader(node), "node {node}");
-        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
-        assert_eq!(told.unwrap(), crc, "node {node}");
+        assert_eq!(program(&mut fleet, node), crc, "node {node}");
     }
 }
 

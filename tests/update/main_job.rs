@@ -42,12 +42,9 @@ fn the_main_job() {
     assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "running");
 
     bench.install(firmware::APP_V2);
-    assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
+    assert_eq!(bench.text(0x100A), "2.0.0");
 
-    bench.power_off();
-    bench.run_ms(500);
-    bench.power_on();
-    bench.await_program(1000);
-    assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
+    bench.restart();
+    assert_eq!(bench.text(0x100A), "2.0.0");
     bench.assert_nothing_unmodelled();
 }

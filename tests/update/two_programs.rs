@@ -14,16 +14,17 @@ use coflash_core::Error;
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
-/// Whether the tests run for the chip of the board with two programs.
-fn is_its_chip() -> bool {
-    let same = firmware::board().chip == LAYOUT.chip;
-    if !same {
+/// A board with two programs; `None` if the tests run for another chip.
+fn board() -> Option<Bench> {
+    if firmware::board().chip != LAYOUT.chip {
         println!("not run: {} has the chip of another board", LAYOUT.board);
+        return None;
     }
-    same
+    Some(Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on())
 }
 
-const VERSION: Address = Address::new(0x100A, 0);
+/// Version of the program that runs: 100Ah.
+const VERSION: u16 = 0x100A;
 
 fn identification(bench: &mut Bench, program: u8) -> u32 {
     let answer = bench.ask(0x601, &[0x40, 0x56, 0x1F, program, 0, 0, 0, 0], 0x581).expect("an answer");
@@ -43,23 +44,13 @@ fn install(bench: &mut Bench, program: u8, file: &Program) {
 }
 
 fn restart(bench: &mut Bench) {
-    bench.power_off();
-    bench.run_ms(10);
-    bench.power_on();
-    bench.await_program(1000);
+    bench.restart();
     bench.run_ms(20);
-}
-
-fn version(bench: &mut Bench) -> String {
-    bench.session().read_text(VERSION).unwrap()
 }
 
 #[test]
 fn two_programs_are_installed_started_and_erased_each_by_itself() {
-    if !is_its_chip() {
-        return;
-    }
-    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
+    let Some(mut bench) = board() else { return };
     // 1F50h to 1F57h have the two programs, the bootloader, and nothing more.
     for index in [0x50, 0x51, 0x56, 0x57] {
         let highest = bench.ask(0x601, &[0x40, index, 0x1F, 0, 0, 0, 0, 0], 0x581).unwrap();
@@ -74,12 +65,12 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     let start = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)).unwrap();
     assert_eq!(start, 0x0201_0000);
     restart(&mut bench);
-    assert_eq!((identification(&mut bench, 1), version(&mut bench).as_str()), (0, "2.0.0"));
+    assert_eq!((identification(&mut bench, 1), bench.text(VERSION).as_str()), (0, "2.0.0"));
     assert_eq!(identification(&mut bench, 2), second.crc());
 
     install(&mut bench, 1, &first);
     restart(&mut bench);
-    assert_eq!(version(&mut bench), "1.0.0");
+    assert_eq!(bench.text(VERSION), "1.0.0");
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     bench.run_ms(20);
@@ -94,17 +85,14 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     assert_eq!(identification(&mut bench, 1), 0);
     assert!(bench.machine().flash()[place..] == before);
     restart(&mut bench);
-    assert_eq!(version(&mut bench), "2.0.0");
+    assert_eq!(bench.text(VERSION), "2.0.0");
 }
 
 /// A program that was linked for the other place is refused: its vectors would point into the other
 /// program.
 #[test]
 fn a_block_for_the_other_program_is_refused() {
-    if !is_its_chip() {
-        return;
-    }
-    let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
+    let Some(mut bench) = board() else { return };
     let second = blocks(firmware::PROGRAM_2, 2);
     let options = FlashOptions::default().program(1).start(false).repeats(0);
     // The device reports its regions to the host, and the host sends nothing. A host without this
@@ -126,24 +114,18 @@ const PAIRS: [(&str, &str); 2] =
 /// bootloader, as in the manual, and the application serves each program's sub-index.
 #[test]
 fn a_second_program_is_written_to_a_running_device() {
-    if !is_its_chip() {
-        return;
-    }
     for (first, second) in PAIRS {
-        let mut bench =
-            Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
+        let Some(mut bench) = board() else { return };
         let (one, two) = (blocks(first, 1), blocks(second, 2));
         flash(&mut bench.session(), &one, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
         let read = |bench: &mut Bench, index: u8, sub: u8| {
             bench.ask(0x601, &[0x40, index, 0x1F, sub, 0, 0, 0, 0], 0x581).expect("an answer")
         };
         // 1F51h: running, absent; the third one is the bootloader, and there is no fourth one (06090011h).
-        assert_eq!(read(&mut bench, 0x51, 0), [0x4F, 0x51, 0x1F, 0, 3, 0, 0, 0]);
-        assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
-        assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 3, 0, 0, 0]);
-        assert_eq!(read(&mut bench, 0x51, 3), [0x4F, 0x51, 0x1F, 3, 0, 0, 0, 0]);
-        assert_eq!(read(&mut bench, 0x51, 4), [0x80, 0x51, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
-        for index in [0x56, 0x57] {
+        for (sub, state) in [(1, 1), (2, 3), (3, 0)] {
+            assert_eq!(read(&mut bench, 0x51, sub), [0x4F, 0x51, 0x1F, sub, state, 0, 0, 0], "{first}");
+        }
+        for index in [0x51, 0x56, 0x57] {
             assert_eq!(read(&mut bench, index, 0), [0x4F, index, 0x1F, 0, 3, 0, 0, 0]);
             assert_eq!(read(&mut bench, index, 4), [0x80, index, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
         }
@@ -180,13 +162,9 @@ fn a_second_program_is_written_to_a_running_device() {
 /// 80h to another program's sub-index calls the bootloader, also if that program is fresh.
 #[test]
 fn commands_for_the_other_program_lead_into_the_bootloader() {
-    if !is_its_chip() {
-        return;
-    }
     for (first, _) in PAIRS {
         for value in [0x00, 0x03, 0x80] {
-            let mut bench =
-                Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER)).switched_on();
+            let Some(mut bench) = board() else { return };
             let mut session = bench.session();
             session.transfer_by(Transfers::Segments);
             let image = firmware::raw_from(LAYOUT.programs[0].base, &firmware::of_board(LAYOUT.board, first));

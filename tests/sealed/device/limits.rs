@@ -31,8 +31,7 @@ fn board_at(rate: BitRate) -> Bench {
     let mut bench = open_board();
     change_over(&mut bench, rate);
     provision(&mut bench);
-    bench.power_on();
-    bench.await_boot_up(100);
+    bench.switch_on();
     bench.run_ms(50);
     bench
 }
@@ -139,8 +138,7 @@ fn access_is_answered_within_5_ms() {
         let mut bench = open_board();
         change_over(&mut bench, rate);
         provision(&mut bench);
-        bench.power_on();
-        bench.await_boot_up(100);
+        bench.switch_on();
         let from = bench.time();
         let asked = [right::STORE, 0, root().public().id()];
         let tbs = challenge(&mut bench.session()).unwrap().tbs(asked[0], asked[1], asked[2]);
@@ -216,8 +214,7 @@ fn a_sealed_program_of_400_kib_is_started_within_5_ms() {
 #[test]
 fn the_bootloader_is_there_as_soon_as_an_open_one() {
     let mut bench = board();
-    bench.power_on();
-    let power_on = bench.await_boot_up(100) - Time(0);
+    let power_on = bench.switch_on() - Time(0);
     let file = seal(&sealer(COUNTER), firmware::APP_V1);
     assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
     start(&mut bench, firmware::APP_V1, "1.0.0");
