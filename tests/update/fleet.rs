@@ -258,8 +258,10 @@ fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>)
 #[test]
 fn a_device_with_another_checksum_is_updated_alone() {
     let file = file(KIB);
-    let (mut fleet, update) =
-        with_another(|machine| machine.load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap(), &file);
+    let of_crc_16 = |machine: &mut Machine| {
+        machine.load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap();
+    };
+    let (mut fleet, update) = with_another(of_crc_16, &file);
     assert_eq!(update.done(), 3, "{:?}", update.results);
     let bytes: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes.into_owned()).collect();
     for (node, crc) in [(1, file.crc()), (2, kit::bench::crc16(&bytes)), (3, file.crc())] {

@@ -379,7 +379,7 @@ fn gdb(address: &str, commands: &[&str]) -> String {
 #[cfg(unix)]
 fn gdb_stops_steps_looks_and_changes() {
     let image = program(&folder("gdb"), "counts");
-    let (mut board, mut control, address) = for_gdb(&image);
+    let (board, mut control, address) = for_gdb(&image);
     // Commands, and what they print.
     let steps = [
         ("monitor reset", ""),
