@@ -85,18 +85,30 @@ fn each_way_back_is_short_with_the_slowest_and_the_fastest_lsi() {
     }
 }
 
-/// A watchdog of its own that the application feeds does not make the way longer.
+/// A watchdog of its own that the application feeds, LSI / 256 with 61 s, does not make the way longer than the update of
+/// its prescaler, which takes five periods of the LSI (RM0090 section 21.4.4), or of the prescaler (ST's HAL).
 #[test]
 fn the_way_back_by_the_watchdog_is_short_though_it_runs_already() {
-    let mut bench = running_board();
-    write(&mut bench, REENTRY_PATH, 1).unwrap();
-    // 512 ms: longer than the way back.
-    bench.machine().preset_watchdog(0xFFF);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    let answered = bench.time();
-    assert!(bench.await_boot_up(1000) - answered < Span::from_millis(19));
-    assert!(bench.is_bootloader(NODE));
-    bench.assert_nothing_unmodelled();
+    const IWDG_KR: u32 = 0x4000_3000;
+    const IWDG_PR: u32 = 0x4000_3004;
+    for (iwdg_update_prescaled, periods) in [(false, 5 + 2 * 4), (true, 5 * 256 + 2 * 4)] {
+        let silicon = Silicon { lsi_hz: 17_000, iwdg_update_prescaled, ..TYPICAL };
+        let mut bench =
+            crate::standby::running_board(firmware::BOOTLOADER, firmware::APP_TEST, silicon, false);
+        write(&mut bench, REENTRY_PATH, 1).unwrap();
+        bench.machine().preset_watchdog(0xFFF);
+        for (register, value) in [(IWDG_KR, 0x5555_u32), (IWDG_PR, 6)] {
+            bench.machine().poke(register, &value.to_le_bytes()).unwrap();
+        }
+        bench.run_ms(200);
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        let answered = bench.time();
+        let us = (bench.await_boot_up(1000) - answered).0 / 1_000_000;
+        let limit = 18_000 + periods * 1_000_000 / 17_000;
+        assert!((10_000..=limit).contains(&us), "{iwdg_update_prescaled}: {us} us");
+        assert!(bench.is_bootloader(NODE));
+        bench.assert_nothing_unmodelled();
+    }
 }
 
 /// Jumps during thousands of interrupts, repeated: no stray interrupt reaches the other program.
