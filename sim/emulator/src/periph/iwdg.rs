@@ -240,10 +240,11 @@ impl Peripheral for Iwdg {
 
     fn next_event(&self) -> Option<Time> {
         if self.expired {
-            None
-        } else {
-            self.expires()
+            return None;
         }
+        // A program waits for the updates, too.
+        let updates = [self.prescaler.ends, self.reload.ends];
+        updates.into_iter().flatten().filter(|ends| *ends != Crossing::NEVER).chain(self.expires()).min()
     }
 
     fn reset(&mut self) {
