@@ -184,6 +184,9 @@ const WRONG_MOST: u32 = 2;
 const TOLD_MOST: u32 = 100;
 /// How many lines wait for a message: the longest plan of a machine has a line for each program of 127 devices.
 const PHASES_MOST: usize = 1000;
+/// What a failure adds if an agent before this one, or an attempt that was interrupted, has begun with the device.
+const BEGUN_EARLIER: &str =
+    "an earlier attempt of this action has begun with the device, and may have changed it";
 /// The progress that is worth a message, in percent.
 const WORTH: u8 = 10;
 
@@ -857,7 +860,12 @@ impl Controller {
     }
 
     /// Writes the end of an action into the record; it is reported to the server when it is there.
-    fn end(&mut self, action: &str, ok: bool, details: Vec<String>) {
+    fn end(&mut self, action: &str, ok: bool, mut details: Vec<String>) {
+        // A failure before the device was asked says nothing of what an earlier attempt has done to it.
+        let is_first = matches!(self.work, Work::Flashing { first: true, .. });
+        if !ok && !is_first && self.record.has_begun(action) {
+            details.push(BEGUN_EARLIER.to_string());
+        }
         let words = details.join("; ");
         let kind = if ok { Kind::Updated } else { Kind::Failed };
         self.say(kind, format!("action {action}: {words}"));

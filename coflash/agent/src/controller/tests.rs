@@ -358,16 +358,29 @@ fn only_a_file_that_is_meant_and_can_be_checked_is_fetched() {
 #[test]
 fn a_server_that_lies_is_asked_once_more_and_nothing_is_flashed() {
     let mut drive = Drive::new();
-    drive.deploy(&deployment("8", "forced"));
-    drive.feedback();
-    assert!(matches!(drive.next(), Step::Fetch(_)));
-    drive.controller.fetched(drive.now, Piece::Wrong("its SHA-256 is another".into()));
-    assert!(matches!(drive.next(), Step::Fetch(_)));
-    drive.controller.fetched(drive.now, Piece::Wrong("its SHA-256 is another".into()));
-    let Request::Post(_, body) = drive.asks() else { panic!() };
-    assert_eq!(body["status"]["result"]["finished"], "failure");
-    assert!(body["status"]["details"][0].as_str().unwrap().contains("was not flashed"), "{body}");
-    assert!(drive.disk.begun.is_none());
+    drive.go_to_flash();
+    for (mut drive, begun) in [(Drive::new(), false), (drive.restarted(), true)] {
+        drive.deploy(&deployment("8", "forced"));
+        drive.feedback();
+        assert!(matches!(drive.next(), Step::Fetch(_)));
+        drive.controller.fetched(drive.now, Piece::Wrong("its SHA-256 is another".into()));
+        assert!(matches!(drive.next(), Step::Fetch(_)));
+        drive.controller.fetched(drive.now, Piece::Wrong("its SHA-256 is another".into()));
+        let Request::Post(_, body) = drive.asks() else { panic!() };
+        assert_eq!(body["status"]["result"]["finished"], "failure");
+        assert!(body["status"]["details"][0].as_str().unwrap().contains("was not flashed"), "{body}");
+        assert_eq!(body["status"]["details"][1] == BEGUN_EARLIER, begun, "{body}");
+        assert!(drive.disk.begun.is_none());
+    }
+    // A file that is found bad later, and the failure of a first attempt, which asks the device.
+    for (begun, last) in [(drive.restarted(), BEGUN_EARLIER), (Drive::new(), "bad")] {
+        let mut drive = begun;
+        drive.fetch(&deployment("8", "forced"));
+        drive.deploy(&deployment("8", "forced"));
+        assert!(matches!(drive.next(), Step::Flash(_)));
+        drive.controller.flashed(drive.now, Flashed::Failed(vec!["bad".into()]));
+        assert!(drive.says(last));
+    }
 }
 
 #[test]
