@@ -203,7 +203,6 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     ) -> io::Result<bool> {
         let reset;
         let mut more = false;
-        let mut cause = ResetCause::Pin;
         match &mut self.phase {
             Phase::Bootloader(running) => {
                 running.device.set_time(now);
@@ -229,7 +228,6 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 reset = match hosted {
                     None => running.leave_or_exchange(now, send).map(Some),
                     Some(hosted) => {
-                        cause = ResetCause::Software;
                         hosted.leaving = hosted.leaving.or_else(|| running.leave_or_exchange(now, send));
                         let ending = hosted.process.poll(hosted.leaving.is_some());
                         if let Some(ending) = ending {
@@ -253,7 +251,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 Phase::Silent(idle) => idle,
                 Phase::None => return Ok(false),
             };
-            report(self.reset(idle, cause, request));
+            report(self.reset(idle, ResetCause::Software, request));
             more = true;
         }
         Ok(more)

@@ -43,6 +43,8 @@ fn the_steps_of_an_update_one_by_one() {
     on(FLASH);
     assert!(on(&["more", "status"]).contains("running"));
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
+    // The call ends a program by a reset of software.
+    assert_eq!(coflash.json(&["read", "2007/3", "-N", "5"])["number"], 3);
     assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
     assert!(on(&["more", "withdraw"]).contains("no longer released for autostart"));
     // START is then a trial, and after the next reset the device stays in the bootloader.
