@@ -59,8 +59,9 @@ impl Scan {
             true => adapter.health().and_then(|health| health.advice()),
             false => None,
         };
-        let table = Table { found: &found, advice: advice.as_deref() };
-        context.result(table, || json!({ "nodes": values(&found), "advice": advice }));
+        let asked = |node: &NodeId| options.ask && options.nodes.contains(node);
+        let table = Table { found: &found, asked: &asked, advice: advice.as_deref() };
+        context.result(table, || json!({ "nodes": values(&found, &asked), "advice": advice }));
         Ok(())
     }
 }
@@ -68,6 +69,8 @@ impl Scan {
 /// A line for each node.
 struct Table<'f> {
     found: &'f BTreeMap<NodeId, Found>,
+    /// Whether a node was asked.
+    asked: &'f dyn Fn(&NodeId) -> bool,
     /// The reason why no node answered, if it is known.
     advice: Option<&'f str>,
 }
@@ -83,20 +86,21 @@ impl std::fmt::Display for Table<'_> {
             };
         }
         let heads = ["node", "runs", "name", "software", "serial", "program", "heartbeat"];
-        let rows =
-            std::iter::once(heads.map(String::from)).chain(self.found.iter().map(row)).collect::<Vec<_>>();
+        let rows = self.found.iter().map(|(node, found)| row(node, found, (self.asked)(node)));
+        let rows = std::iter::once(heads.map(String::from)).chain(rows).collect::<Vec<_>>();
         f.write_str(&table(&rows))
     }
 }
 
-fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
+fn row(node: &NodeId, found: &Found, asked: bool) -> [String; 7] {
     let none = || "-".to_string();
     let state = found.state.map_or_else(none, |state| state_words(state).to_string());
     let node = node.to_string();
     let Some(info) = &found.info else {
         let runs = match &found.but {
             Some(but) => format!("answers, but {but}"),
-            None => "no answer".to_string(),
+            None if asked => "no answer".to_string(),
+            None => "not asked".to_string(),
         };
         return [node, runs, none(), none(), none(), none(), state];
     };
@@ -132,12 +136,12 @@ fn cell(program: &ProgramInfo) -> String {
     format!("{state}{}{}", crc.unwrap_or_default(), version.unwrap_or_default())
 }
 
-fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {
+fn values(found: &BTreeMap<NodeId, Found>, asked: &dyn Fn(&NodeId) -> bool) -> Vec<Value> {
     let value = |(node, found): (&NodeId, &Found)| {
         json!({
             "node": node.get(),
             "state": found.state.map(state_words),
-            "answers": found.info.is_some() || found.but.is_some(),
+            "answers": asked(node).then_some(found.info.is_some() || found.but.is_some()),
             "but": found.but,
             "info": found.info,
         })
