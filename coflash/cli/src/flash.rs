@@ -469,17 +469,15 @@ impl Flash {
         drop(waiting);
         let (name, image) = (format!("node {node}"), device.image.display().to_string());
         let outcome = Outcome { node: Some(node), name, image, result };
-        if let Some(path) = &self.report {
-            write_report(path, &document(std::slice::from_ref(&outcome)))?;
-        }
+        let write = |path| write_report(path, &document(std::slice::from_ref(&outcome)));
+        let written = self.report.as_deref().map_or(Ok(()), write);
         let report = outcome.result?;
-        context.result(report, || {
-            let mut value = json!(report);
-            value["node"] = node.get().into();
-            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
-            value
-        });
-        Ok(())
+        let mut value = json!(report);
+        value["node"] = node.get().into();
+        value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
+        let written = written.map_err(|failure| failure.within(&mut value));
+        context.result(report, || value);
+        written
     }
 
     fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {

@@ -142,7 +142,7 @@ impl Lss {
         let done = {
             let mut master = self.master(&mut *adapter)?;
             let done = match &self.service {
-                Service::Fastscan(fastscan) => fastscan.run(&mut master, context),
+                Service::Fastscan(fastscan) => Ok(fastscan.run(&mut master, context)),
                 Service::Assign(assign) => assign.run(&mut master),
                 Service::BitRate(rate) => rate.run(&mut master),
                 Service::Store(device) => device.store(&mut master),
@@ -151,15 +151,19 @@ impl Lss {
             // A device that has switched its bit rate is silent and already in waiting state.
             let back = master.switch_all(false);
             let done = done?;
-            back?;
+            if done.ended.is_ok() {
+                back?;
+            }
             done
         };
         if let Some(node) = done.reset {
             adapter.send(&NmtCommand::ResetCommunication.emit(Some(node)))?;
         }
         drop(waiting);
-        context.result(done.words, || done.value);
-        Ok(())
+        let (mut value, ended) = (done.value, done.ended);
+        let ended = ended.map_err(|failure| failure.within(&mut value));
+        context.result(done.words, || value);
+        ended
     }
 
     fn master<'a>(&self, adapter: &'a mut dyn Adapter) -> Result<Master<'a>, Failure> {
@@ -175,41 +179,59 @@ struct Done {
     value: Value,
     /// The node-ID of the device whose communication must be reset.
     reset: Option<NodeId>,
+    /// Why it has ended early, if it has: what was done until then is told all the same.
+    ended: Result<(), Failure>,
+}
+
+impl Done {
+    fn new(words: String, value: Value) -> Self {
+        Self { words, value, reset: None, ended: Ok(()) }
+    }
 }
 
 impl Fastscan {
-    fn run(&self, master: &mut Master<'_>, context: &Context) -> Result<Done, Error> {
-        let mut words = Vec::new();
-        let mut devices = Vec::new();
+    fn run(&self, master: &mut Master<'_>, context: &Context) -> Done {
+        let mut found = Vec::new();
+        let ended = self.search(master, &mut |line, device| {
+            context.out.detail(&line);
+            found.push((line, device));
+        });
+        let (mut words, devices): (Vec<String>, Vec<Value>) = found.into_iter().unzip();
+        if words.is_empty() && ended.is_ok() {
+            words.push("no device without a node-ID".to_string());
+        }
+        Done { ended, ..Done::new(words.join("\n"), json!({ "devices": devices })) }
+    }
+
+    /// Tells each device as soon as it has what it is to get.
+    fn search(&self, master: &mut Master<'_>, told: &mut dyn FnMut(String, Value)) -> Result<(), Failure> {
         let mut next = self.assign;
         master.switch_all(false)?;
         while let Some(address) = master.fastscan(&mut |_| {})? {
-            let mut line = shown(&address);
-            let mut device = value(&address);
-            let node = next;
-            if let Some(node) = node {
+            let (mut line, mut device) = (shown(&address), value(&address));
+            if self.assign.is_some() {
+                let Some(node) = next else {
+                    told(format!("{line}: no node-ID"), device);
+                    return Err(Failure::no_node_id_left());
+                };
                 master.set_node_id(Some(node))?;
-                if self.store {
-                    master.store()?;
-                }
                 line = format!("{line}: node {node} from now on");
                 device["node"] = node.get().into();
                 next = NodeId::new(node.get() + 1);
             }
-            context.out.detail(&line);
-            words.push(line);
-            devices.push(device);
+            // From here on the device has it, whatever comes.
+            told(line, device);
+            if self.store {
+                master.store()?;
+            }
             // In waiting state the device takes its node-ID and boots. A device without one would
             // be found again.
             master.switch_all(false)?;
-            if next.is_none() {
+            if self.assign.is_none() {
                 break;
             }
         }
-        if words.is_empty() {
-            words.push("no device without a node-ID".to_string());
-        }
-        Ok(Done { words: words.join("\n"), value: json!({ "devices": devices }), reset: None })
+        Ok(())
     }
 }
 
@@ -233,7 +255,7 @@ impl Assign {
             Some(old) => format!(", effective after coflash reset --communication --node {old}"),
         };
         let value = json!({ "node": self.node.map(NodeId::get), "old": old.map(NodeId::get) });
-        Ok(Done { words: format!("{given}{when}"), value, reset })
+        Ok(Done { reset, ..Done::new(format!("{given}{when}"), value) })
     }
 }
 
@@ -254,11 +276,7 @@ impl SetBitRate {
             None => "does not switch to it yet".to_string(),
         };
         let words = format!("the device is given {} kbit/s and {when}", rate / 1000);
-        Ok(Done {
-            words,
-            value: json!({ "bit_rate": rate, "activated": self.activate.is_some() }),
-            reset: None,
-        })
+        Ok(Done::new(words, json!({ "bit_rate": rate, "activated": self.activate.is_some() })))
     }
 }
 
@@ -266,7 +284,7 @@ impl Selected {
     fn store(self, master: &mut Master<'_>) -> Result<Done, Error> {
         self.select(master)?;
         master.store()?;
-        Ok(Done { words: "node-ID and bit rate are stored".to_string(), value: json!({}), reset: None })
+        Ok(Done::new("node-ID and bit rate are stored".to_string(), json!({})))
     }
 
     fn inquire(self, master: &mut Master<'_>) -> Result<Done, Error> {
@@ -279,7 +297,7 @@ impl Selected {
         };
         let mut value = value(&address);
         value["node"] = node.map(NodeId::get).into();
-        Ok(Done { words, value, reset: None })
+        Ok(Done::new(words, value))
     }
 }
 

@@ -137,7 +137,7 @@ pub(super) fn diagnose_silence(
 pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) -> Result<(), Failure> {
     let failures: Vec<&Failure> =
         outcomes.iter().filter_map(|outcome| outcome.result.as_ref().err()).collect();
-    let document = document(outcomes);
+    let mut document = document(outcomes);
     out.say("");
     for Outcome { name, result, .. } in outcomes {
         match result {
@@ -147,11 +147,20 @@ pub(super) fn summary(out: Output, outcomes: &[Outcome], report: Option<&Path>) 
     }
     let all = outcomes.len();
     out.say(format_args!("{} of {all} devices are done", all - failures.len()));
-    out.value(&document);
-    if let Some(path) = report {
-        write_report(path, &document)?;
-    }
-    Failure::of_all(&failures, all)
+    end(out, &mut document, report, Failure::of_all(&failures, all))
+}
+
+/// Writes the results to their file, and prints them: also those that cannot be written.
+pub(super) fn end(
+    out: Output,
+    document: &mut Value,
+    report: Option<&Path>,
+    result: Result<(), Failure>,
+) -> Result<(), Failure> {
+    let written = report.map_or(Ok(()), |path| write_report(path, document));
+    let written = written.map_err(|failure| failure.within(document));
+    out.value(document);
+    written.and(result)
 }
 
 /// The results of all devices, as JSON.

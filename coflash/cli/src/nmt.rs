@@ -109,18 +109,18 @@ impl Nmt {
             node.is_some_and(|node| heard.get(&node) == Some(&target))
         })?;
         drop(waiting);
-        context.result(self.words(node, &heard, reset), || {
-            let nodes: Vec<_> = heard
-                .iter()
-                .map(|(node, state)| json!({ "node": node.get(), "state": state_words(*state), "confirmed": *state == target }))
-                .collect();
-            let name = self.command.to_possible_value().map(|value| value.get_name().to_string());
-            json!({ "service": name, "node": node.map(NodeId::get), "heard": nodes })
-        });
-        match node {
-            Some(node) if reset && heard.is_empty() => Err(Failure::no_boot_up(node)),
+        let nodes: Vec<_> = heard
+            .iter()
+            .map(|(node, state)| json!({ "node": node.get(), "state": state_words(*state), "confirmed": *state == target }))
+            .collect();
+        let name = self.command.to_possible_value().map(|value| value.get_name().to_string());
+        let mut value = json!({ "service": name, "node": node.map(NodeId::get), "heard": nodes });
+        let result = match node {
+            Some(node) if reset && heard.is_empty() => Err(Failure::no_boot_up(node).within(&mut value)),
             _ => Ok(()),
-        }
+        };
+        context.result(self.words(node, &heard, reset), || value);
+        result
     }
 
     fn words(&self, node: Option<NodeId>, heard: &BTreeMap<NodeId, NmtState>, reset: bool) -> String {

@@ -332,6 +332,12 @@ impl Failure {
         Self::new(Exit::NoAnswer, what).advised(advice)
     }
 
+    /// A device without a node-ID, for which none is left.
+    pub(super) fn no_node_id_left() -> Self {
+        let advice = "begin with a lower node-ID";
+        Self::new(Exit::Some, "no node-ID is left for further devices").advised(advice)
+    }
+
     /// A device that differs from a file in `count` properties; each one was shown.
     pub(super) fn differs(node: NodeId, count: usize) -> Self {
         let what = match count {
@@ -381,6 +387,12 @@ impl Failure {
     /// The same failure, which the output of the command has shown already.
     fn shown(self) -> Self {
         Self { is_shown: true, ..self }
+    }
+
+    /// The same failure, as a part of the only document of the command.
+    pub(super) fn within(self, document: &mut Value) -> Self {
+        document["error"] = self.value()["error"].take();
+        self.shown()
     }
 
     /// An error of the command line's parser.
@@ -632,16 +644,17 @@ impl From<Error> for Failure {
             Error::Cancelled => Exit::Cancelled,
             Error::NotInDialect { .. } | Error::NoPassword { .. } => Exit::Usage,
             Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,
+            // The file, found out before anything was changed.
+            Error::SealedOnly { .. }
+            | Error::WrongTarget { .. }
+            | Error::NoProgram { .. }
+            | Error::OtherRegion { .. } => Exit::File,
             Error::Refused { .. }
             | Error::Protocol { .. }
             | Error::ShortAnswer { .. }
-            | Error::SealedOnly { .. }
             | Error::Failed { .. }
             | Error::Busy { .. }
             | Error::WrongCrc { .. }
-            | Error::WrongTarget { .. }
-            | Error::NoProgram { .. }
-            | Error::OtherRegion { .. }
             | Error::NotAlone { .. }
             | Error::NotRenewable { .. }
             | Error::Lss { .. } => Exit::Device,

@@ -24,7 +24,7 @@ use super::context::Context;
 use super::convert::same_file;
 use super::device::{asked, cancelled, Patience};
 use super::file::front;
-use super::many::{begin, write_report, Board};
+use super::many::{begin, end, Board};
 use super::output::Failure;
 use super::output_file;
 use super::record;
@@ -470,12 +470,9 @@ fn summary(
     out.say(format_args!("{} of {all} programs are in their devices", all - failed));
     let mut document = json!({ "command": "flash", "devices": devices, "failed": failed });
     (document["package"], document["foreign"]) = (path.display().to_string().into(), json!(plan.foreign));
-    if let Some(report) = report {
-        write_report(report, &document)?;
-    }
-    if all == 0 {
-        return Err(Failure::no_device_for(path));
-    }
-    out.value(&document);
-    Failure::of_all(&failures.iter().collect::<Vec<_>>(), all)
+    let result = match all {
+        0 => Err(Failure::no_device_for(path).within(&mut document)),
+        _ => Failure::of_all(&failures.iter().collect::<Vec<_>>(), all),
+    };
+    end(out, &mut document, report, result)
 }

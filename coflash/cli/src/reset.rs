@@ -63,13 +63,13 @@ impl Reset {
                 format!("back on the bus: node {}", nodes.join(", "))
             }
         };
-        context.result(words, || {
-            let back: Vec<u8> = back.iter().map(|node| node.get()).collect();
-            json!({ "node": node.map(NodeId::get), "booted": back })
-        });
-        match node {
-            Some(node) if back.is_empty() => Err(Failure::no_boot_up(node)),
+        let booted: Vec<u8> = back.iter().map(|node| node.get()).collect();
+        let mut value = json!({ "node": node.map(NodeId::get), "booted": booted });
+        let result = match node {
+            Some(node) if back.is_empty() => Err(Failure::no_boot_up(node).within(&mut value)),
             _ => Ok(()),
-        }
+        };
+        context.result(words, || value);
+        result
     }
 }

@@ -243,6 +243,11 @@ fn reset_waits_for_the_boot_up() {
     // A node that is not there.
     let (done, _) = served(quick(APPLICATION), &["reset", "-N", "6", "--boot-timeout", "50"]);
     done.fails(5, &["node 6 has sent no boot-up message"]);
+    for (words, heard) in [(&["reset"][..], "booted"), (&["nmt", "reset"], "heard")] {
+        let words = [words, &["-N", "6", "--boot-timeout", "50", "--json"]].concat();
+        let json = served(quick(APPLICATION), &words).0.json();
+        assert_eq!((&json[heard], &json["error"]["exit"]), (&serde_json::json!([]), &5.into()));
+    }
 }
 
 #[test]
@@ -270,9 +275,10 @@ fn scan_finds_who_answers_and_who_is_heard() {
         (&true.into(), &false.into())
     );
     let (done, bus) = scan(&["--listen-only"]);
-    done.says(&["no answer"]);
+    done.says(&["20    not asked"]);
     assert!(bus.0.iter().all(|fake| fake.sent.is_empty()));
-    scan(&["-N", "9,11-12"]).0.says(&["\n9     bootloader"]);
+    scan(&["-N", "9,11-12"]).0.says(&["\n9     bootloader", "\n20    not asked"]);
+    assert_eq!(scan(&["-N", "9", "--json"]).0.json()["nodes"][2]["answers"], Value::Null);
     // An unfinished transfer of another tool is aborted first: within a block download, a request
     // can be taken for a segment.
     let folder = folder("scan");
@@ -415,6 +421,15 @@ fn lss_says_what_it_does() {
     assert_eq!(device.orders, [[0x13, 0, 0], [0x17, 0, 0]]);
     let (done, device) = lss(&["store"]);
     assert_eq!((done.exit, device.orders), (0, vec![[0x17, 0, 0]]));
+    // Of two devices the second one has no node-ID left: the first one is told all the same.
+    let mut two = unconfigured();
+    two.more = 1;
+    let words = ["lss", "--lss-timeout", "50", "fastscan", "--assign", "127", "--json"];
+    let (done, _) = served(two, &words);
+    let json = done.json();
+    assert_eq!((done.exit, &json["devices"][0]["node"]), (8, &127.into()));
+    assert_eq!(json["devices"][1]["serial_number"], 7);
+    assert!(json["error"]["what"].to_string().contains("no node-ID is left"), "{json}");
     // A device that does not exist.
     let (done, device) =
         lss(&["assign", "-N", "9", "--vendor", "1", "--product", "2", "--revision", "3", "--serial", "4"]);

@@ -196,7 +196,7 @@ const MISTAKES: &[Mistake] = &[
     Mistake("enter -N 5 {node}", Device(|| refusing_command(0x80, Outcome::Ignore, APPLICATION)), 7,
         &["node 5", "coflash more catch", "strap"]),
     Mistake("flash -N 5 {hex} --vid 0x40 --pid 1234 --check-target {node}",
-        Device(|| Fake::new(APPLICATION)), 6,
+        Device(|| Fake::new(APPLICATION)), 3,
         &["the program is for vendor-ID 00000040h", "it was not changed", "belong together"]),
     // The file.
     Mistake("flash {missing} --bus {bus}", Device(absent), 3,

@@ -57,7 +57,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         [(&file, 1000, "the device has room for 1000"), (&room.path("other.cbs"), 0x10000, "product code")]
     {
         let (done, _, writes) = flashed(file, space, 0, &[]);
-        done.fails(6, &[words]);
+        done.fails(3, &[words]);
         assert!(writes.is_empty(), "{words}: {writes:?}");
     }
     coflash(&["flash", &file, "-P", "2"]).fails(3, &["it is for program 1, and program 2 is to be written"]);
@@ -94,7 +94,7 @@ fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
         (lowest(4, 8), counter, "a higher --counter"),
     ] {
         let (done, fake) = on(BOOTLOADER, Objects::sealed(&program()).but(told), &["flash", &file]);
-        done.fails(6, &[words, advice, "it was not changed", "[0x6000018c]"]);
+        done.fails(3, &[words, advice, "it was not changed", "[0x6000018c]"]);
         assert!(!done.err.contains("program is old") && fake.writes().is_empty(), "{}", done.err);
     }
     // A right for a lower counter has been granted; and what the device takes.
@@ -238,7 +238,7 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
     // A device that does not report its program's start, and one that does not accept blocks.
     let unanswered = Objects::sealed(program).but(((0x2004, 1), Vec::new()));
     let (done, fake) = on(BOOTLOADER, unanswered, &["flash", &file, "--blocks"]);
-    done.fails(6, &["the start of its program (2004h)"]);
+    done.fails(3, &["the start of its program (2004h)"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     let words = ["flash", &file, "--blocks", "--dialect", "raw"];
     let (done, fake) = on(BOOTLOADER, Objects::sealed(program), &words);
@@ -253,11 +253,11 @@ fn a_device_without_keys_gets_no_sealed_image() {
     let file = room.path("app.cbs");
     let open = || Objects::sealed(&program()).but(challenge(SEALED & 0xFFFF));
     let (done, fake) = on(BOOTLOADER, open(), &["flash", &file]);
-    done.fails(6, &["the device is not sealed", "coflash seal provision", "it was not changed"]);
+    done.fails(3, &["the device is not sealed", "coflash seal provision", "it was not changed"]);
     assert!(fake.writes().is_empty(), "{:?}", fake.writes());
     // An application does not report it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
-    done.fails(6, &["the device is not sealed", "its application is running; it was not changed"]);
+    done.fails(3, &["the device is not sealed", "its application is running; it was not changed"]);
     assert_eq!(fake.writes(), ["command 80", "command 01"]);
 }
 

@@ -52,6 +52,27 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
     }
 }
 
+/// A file for the results that cannot be written at the end: the results are told, with that, in one document.
+#[test]
+fn what_cannot_be_written_is_told_with_what_was_done() {
+    let (folder, file) = (folder("gone"), data("plain-400.blk"));
+    for nodes in ["5", "5,6"] {
+        let gone = std::path::PathBuf::from(folder.path("gone"));
+        fs::create_dir(&gone).unwrap();
+        let report = gone.join("report.json").display().to_string();
+        let mut removes = device(5, BOOTLOADER);
+        removes.on_block = Box::new(move |_| {
+            let _ = fs::remove_dir_all(&gone);
+            Outcome::Accept
+        });
+        let bus = Bus(vec![removes, device(6, BOOTLOADER)]);
+        let (done, _) = served(bus, &["flash", &file, "--node", nodes, "--report", &report, "--json"]);
+        let json = done.json();
+        let size = if nodes == "5" { &json["size"] } else { &json["devices"][1]["report"]["size"] };
+        assert_eq!((done.exit, size, &json["error"]["exit"]), (1, &4001.into(), &1.into()));
+    }
+}
+
 #[test]
 fn a_job_file_says_who_gets_what() {
     let folder = folder("job");
@@ -93,6 +114,8 @@ pub struct Unconfigured {
     pub configured: bool,
     selected: usize,
     pub orders: Vec<[u8; 3]>,
+    /// So many more devices without node-ID come after it, with the same address.
+    pub more: u8,
 }
 
 const ADDRESS: [u32; 4] = [0x3F, 2, 0x10000, 7];
@@ -119,6 +142,20 @@ impl coboot_can::Adapter for Unconfigured {
                     self.fake.running = Some(BOOTLOADER);
                     self.fake.inject(Frame::of(CobId::new(0x700 + u16::from(self.node)).unwrap(), &[0]));
                 }
+                if !self.configured && self.node != 0xFF && self.more > 0 {
+                    (self.node, self.more) = (0xFF, self.more - 1);
+                }
+            }
+            0x51 if !self.configured && self.node == 0xFF => {
+                let [bit, part, next] = [bytes[5], bytes[6], bytes[7]].map(usize::from);
+                if bit == 0x80 {
+                    self.selected = 0;
+                } else if part != self.selected || (ADDRESS[part] ^ number) >> bit != 0 {
+                    return Ok(());
+                } else {
+                    (self.selected, self.configured) = (next, next < part);
+                }
+                self.answer(0x4F, 0);
             }
             part @ 0x40..=0x43 => {
                 let part = usize::from(part - 0x40);
@@ -157,7 +194,7 @@ impl coboot_can::Adapter for Unconfigured {
 pub fn unconfigured() -> Unconfigured {
     let mut fake = device(0x7F, BOOTLOADER);
     fake.running = None;
-    Unconfigured { fake, node: 0xFF, configured: false, selected: 0, orders: Vec::new() }
+    Unconfigured { fake, node: 0xFF, configured: false, selected: 0, orders: Vec::new(), more: 0 }
 }
 
 #[test]
