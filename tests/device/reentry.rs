@@ -86,12 +86,13 @@ fn each_way_back_is_short_with_the_slowest_and_the_fastest_lsi() {
 }
 
 /// A watchdog of its own that the application feeds, LSI / 256 with 61 s, does not make the way longer than the update of
-/// its prescaler, which takes five periods of the LSI (RM0090 section 21.4.4), or of the prescaler (ST's HAL).
+/// its prescaler, which takes five periods of the LSI (RM0090 section 21.4.4), or of the prescaler (ST's HAL), and that of
+/// the bootloader's own watchdog, LSI / 64.
 #[test]
 fn the_way_back_by_the_watchdog_is_short_though_it_runs_already() {
     const IWDG_KR: u32 = 0x4000_3000;
     const IWDG_PR: u32 = 0x4000_3004;
-    for (iwdg_update_prescaled, periods) in [(false, 5 + 2 * 4), (true, 5 * 256 + 2 * 4)] {
+    for (iwdg_update_prescaled, periods) in [(false, 5 + 2 * 4), (true, 5 * (256 + 64) + 2 * 4)] {
         let silicon = Silicon { lsi_hz: 17_000, iwdg_update_prescaled, ..TYPICAL };
         let mut bench =
             crate::standby::running_board(firmware::BOOTLOADER, firmware::APP_TEST, silicon, false);
