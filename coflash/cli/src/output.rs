@@ -564,7 +564,7 @@ impl Failure {
                         "control": seen.control,
                         "crc": seen.crc,
                     })),
-                    DeviceAnswer::Silent | DeviceAnswer::NotAsked => None,
+                    DeviceAnswer::Silent | DeviceAnswer::Unchanged | DeviceAnswer::NotAsked => None,
                 }),
                 "advice": self.advice,
                 "answers": self.answers,

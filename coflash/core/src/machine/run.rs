@@ -1,6 +1,6 @@
 //! The run: carries out a plan, program by program in the order of the package.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::atomic::Ordering;
 
 use canopen::NodeId;
@@ -75,8 +75,8 @@ pub fn run(
     on_event: &(dyn Fn(NodeId, usize, Event) + Sync),
 ) -> Vec<Outcome> {
     let mut failed: BTreeSet<NodeId> = BTreeSet::new();
-    // What is known of each device outlives each program.
-    let mut known: BTreeMap<NodeId, DeviceState> = BTreeMap::new();
+    // The devices of which a program was changed: of the others it is not said that the device was not.
+    let mut changed: BTreeSet<NodeId> = BTreeSet::new();
     let mut outcomes = Vec::new();
     for (at, (entry, program)) in package.programs().enumerate() {
         let missing = plan.missing.iter().filter(|missing| missing.entry == at);
@@ -87,18 +87,17 @@ pub fn run(
         let mut due: Vec<(NodeId, Target)> = Vec::new();
         let mut ended: Vec<(NodeId, Result<Good, Bad>)> = Vec::new();
         for device in &plan.devices {
-            let is_the_same = |adapter: &mut dyn Adapter| {
-                let state = known.get(&device.node).copied().unwrap_or(options.known.state());
-                is_the_same(adapter, entry, device, options).map_err(|bad| bad.at_least(state))
-            };
             for step in device.steps.iter().filter(|step| step.entry == at) {
                 let (node, program) = (device.node, entry.name.clone());
                 match &step.todo {
                     // Another machine may be on the bus since then.
-                    Todo::Has => {
-                        let same = is_the_same(&mut *adapter);
-                        ended.push((node, same.map(|_| Good::Had)));
-                    }
+                    Todo::Has => match is_the_same(adapter, entry, device, options) {
+                        // Not compared again: the plan counts.
+                        Ok(_) | Err(Bad::Failed(Failed { error: Error::Cancelled, .. })) => {
+                            ended.push((node, Ok(Good::Had)));
+                        }
+                        Err(bad) => ended.push((node, Err(bad))),
+                    },
                     Todo::Older => {
                         let (has, gets) = (step.from.clone().unwrap_or_default(), step.to.clone());
                         ended.push((node, Err(Bad::Left(DeviceFault::Older { node, program, has, gets }))));
@@ -107,7 +106,7 @@ pub fn run(
                     Todo::Update if failed.contains(&node) => {
                         ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));
                     }
-                    Todo::Update => match is_the_same(&mut *adapter) {
+                    Todo::Update => match is_the_same(adapter, entry, device, options) {
                         Ok(target) => due.push((node, target)),
                         Err(bad) => ended.push((node, Err(bad))),
                     },
@@ -116,15 +115,22 @@ pub fn run(
         }
         ended.extend(update(adapter, at, entry, program, &due, options, on_event));
         ended.sort_by_key(|(node, _)| *node);
+        let is_changed = |result: &Result<Good, Bad>| match result {
+            Ok(Good::Updated(_)) => true,
+            Err(Bad::Failed(failed)) => failed.left.state != DeviceState::Untouched,
+            Ok(Good::Had) | Err(Bad::Left(_)) => false,
+        };
+        changed.extend(ended.iter().filter(|(_, result)| is_changed(result)).map(|(node, _)| *node));
+        for (node, result) in &mut ended {
+            let is_changed = changed.contains(node);
+            let before = if is_changed { DeviceState::OtherChanged } else { options.known.state() };
+            if let Err(Bad::Failed(Failed { left, .. })) = result {
+                *left = left.after(before);
+            }
+        }
         let is_older = |bad: &Bad| matches!(bad, Bad::Left(DeviceFault::Older { .. }));
         let bad = ended.iter().filter(|(_, result)| result.as_ref().is_err_and(|bad| !is_older(bad)));
         failed.extend(bad.map(|(node, _)| *node));
-        let updated = ended.iter().filter_map(|(node, result)| match result {
-            Ok(Good::Updated(report)) if report.renewal.is_none() => Some((*node, report.left())),
-            Err(Bad::Failed(failed)) => Some((*node, failed.left.state)),
-            _ => None,
-        });
-        known.extend(updated);
         outcomes.extend(ended.into_iter().map(|(node, result)| Outcome {
             node: Some(node),
             entry: at,
@@ -169,18 +175,6 @@ fn is_the_same(
             || Target { vendor_id: now[0].unwrap_or(0), product_code: now[1].unwrap_or(0) },
             |identity| Target { vendor_id: identity.vendor, product_code: identity.product },
         )),
-    }
-}
-
-impl Bad {
-    /// The same of a device that is known to be in this state: it is not said to be unchanged.
-    fn at_least(self, known: DeviceState) -> Self {
-        match self {
-            Self::Failed(Failed { error, left }) if left.state == DeviceState::Untouched => {
-                Self::Failed(Failed { error, left: DeviceAfterUpdate { state: known, ..left } })
-            }
-            bad => bad,
-        }
     }
 }
 

@@ -14,6 +14,8 @@ use crate::device::DeviceType;
 pub enum DeviceState {
     /// Nothing was changed.
     Untouched,
+    /// This program was not changed; another one of the device was, in the same run.
+    OtherChanged,
     /// An earlier attempt has begun, and nobody knows how far it came.
     Begun,
     /// The bootloader was called; the old program is intact.
@@ -37,6 +39,7 @@ impl DeviceState {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Untouched => "untouched",
+            Self::OtherChanged => "other_changed",
             Self::Begun => "begun",
             Self::Called => "called",
             Self::Postponed => "postponed",
@@ -52,6 +55,7 @@ impl fmt::Display for DeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Untouched => "it was not changed",
+            Self::OtherChanged => "this program of it was not changed, and another one was",
             Self::Begun => "an earlier attempt has begun with it, and may have changed it",
             Self::Called => "it was called back to the bootloader, and its program is unchanged",
             Self::Postponed => "it was told to erase its program, and has acknowledged nothing of the new one: it may have the old one",
@@ -81,6 +85,8 @@ pub struct DeviceAfterUpdate {
 pub enum DeviceAnswer {
     /// It was not asked: it was not changed, or the connection is lost.
     NotAsked,
+    /// It was not asked: this attempt has not changed it, and its state is from an earlier one.
+    Unchanged,
     /// It does not answer.
     Silent,
     /// It has answered.
@@ -101,6 +107,18 @@ pub struct Answers {
 }
 
 impl DeviceAfterUpdate {
+    /// The same of a device that was in this state before: if this attempt has not changed it, and it has not said
+    /// more itself, it still is.
+    #[must_use]
+    pub fn after(self, before: DeviceState) -> Self {
+        match (self.state, self.answer) {
+            (DeviceState::Untouched, DeviceAnswer::NotAsked | DeviceAnswer::Silent) => {
+                Self { state: before, answer: DeviceAnswer::Unchanged }
+            }
+            _ => self,
+        }
+    }
+
     /// The advice at the end of its text, if there is any.
     #[must_use]
     pub fn advice(&self) -> Option<Advice> {
@@ -121,7 +139,7 @@ impl Answers {
 fn given<S: Serializer>(answer: &DeviceAnswer, serializer: S) -> Result<S::Ok, S::Error> {
     let answers = match answer {
         DeviceAnswer::Given(answers) => Some(answers),
-        DeviceAnswer::NotAsked | DeviceAnswer::Silent => None,
+        DeviceAnswer::NotAsked | DeviceAnswer::Unchanged | DeviceAnswer::Silent => None,
     };
     answers.serialize(serializer)
 }
@@ -129,8 +147,13 @@ fn given<S: Serializer>(answer: &DeviceAnswer, serializer: S) -> Result<S::Ok, S
 impl fmt::Display for DeviceAfterUpdate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.answer {
-            DeviceAnswer::NotAsked | DeviceAnswer::Silent if self.state == DeviceState::Untouched => {
+            DeviceAnswer::NotAsked | DeviceAnswer::Unchanged | DeviceAnswer::Silent
+                if matches!(self.state, DeviceState::Untouched | DeviceState::OtherChanged) =>
+            {
                 self.state.fmt(f)
+            }
+            DeviceAnswer::Unchanged => {
+                write!(f, "this attempt has not changed it; known from before: {}", self.state)
             }
             DeviceAnswer::NotAsked => write!(f, "it cannot be asked any more; last known: {}", self.state),
             DeviceAnswer::Silent => write!(f, "it does not answer; last known: {}", self.state),

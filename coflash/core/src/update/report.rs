@@ -6,7 +6,6 @@ use std::time::Duration;
 use serde::{Serialize, Serializer};
 use shared_abi::ram_image::Version;
 
-use super::device_after::DeviceState;
 use crate::device::{DeviceType, Dialect, Transfers};
 use crate::json;
 
@@ -48,17 +47,6 @@ pub struct Report {
     /// The results of a renewal, if the file is a bootloader.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub renewal: Option<Renewal>,
-}
-
-impl Report {
-    /// What is in the device after the update of a program.
-    pub(crate) const fn left(&self) -> DeviceState {
-        match self.released {
-            None => DeviceState::Written,
-            Some(false) => DeviceState::Unreleased,
-            Some(true) => DeviceState::Released,
-        }
-    }
 }
 
 /// Only the device type: it is known that an application runs.

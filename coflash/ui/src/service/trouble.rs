@@ -98,6 +98,7 @@ fn left(after: DeviceAfterUpdate) -> &'static str {
     match after.state {
         DeviceState::Called | DeviceState::Postponed if is_empty => "left-none",
         DeviceState::Untouched => "left-untouched",
+        DeviceState::OtherChanged => "left-other",
         DeviceState::Called => "left-old",
         DeviceState::Postponed | DeviceState::Begun => "left-unknown",
         DeviceState::Erased => "left-none",

@@ -11,7 +11,7 @@ use coflash_core::file::checksum::CRC as CRC32;
 use coflash_core::file::convert::{program_of, Label, Options};
 use coflash_core::file::{block_file, raw, Firmware};
 use coflash_core::machine::{
-    make, plan, run, Bad, DeviceFault, Good, Outcome, Package, Part, Plan, PlanError, RunOptions, Todo,
+    make, plan, run, Bad, DeviceFault, Good, Outcome, Package, Part, Plan, PlanError, RunOptions,
 };
 use coflash_core::update::many::ManyOptions;
 use coflash_core::update::{DeviceState, Event, FlashOptions};
@@ -469,12 +469,14 @@ fn a_device_that_is_gone_costs_the_others_nothing() {
     assert_eq!(outcomes[2], (Some(5), 1, "6000040Dh".to_owned()));
 }
 
-/// Cancelled in the first of three devices: the outcome of each is kept, and the next run does the rest.
+/// Cancelled in the first of three devices: the outcome of each is kept, and the next run does the rest. What the
+/// third one has by the plan, it still has.
 #[test]
 fn an_interrupted_run_is_continued_by_the_next() {
     let package = package(&[("panel", r#""nodes": [9]"#), ("drive", DRIVES)]);
     let mut bus = Bus(vec![device(5, 1234), device(6, 1234), device(9, 1)]);
     bus.0.iter_mut().for_each(|fake| fake.crc_of_application = None);
+    bus.0[1].crc_of_application = Some(CRC);
     let plan = planned(&mut bus, &package);
     let flag: Arc<AtomicBool> = Arc::default();
     let options = RunOptions::default().many(ManyOptions::default().cancelled(flag.clone()));
@@ -484,16 +486,37 @@ fn an_interrupted_run_is_continued_by_the_next() {
     });
     let outcomes = run(&mut interrupted, &package, &plan, &options, &|_, _, _| {});
     let mut bus = interrupted.of;
-    assert_eq!(outcomes.len(), 3);
-    let states = [DeviceState::Erased, DeviceState::Untouched, DeviceState::Untouched];
-    for (outcome, state) in outcomes.iter().zip(states) {
-        let Err(Bad::Failed(failed)) = &outcome.result else { panic!("{:?}", words(&outcomes)) };
-        assert!(matches!(failed.error, Error::Cancelled), "{failed:?}");
-        assert_eq!(failed.left.state, state);
-    }
+    let cancelled = |state: &str| format!("{:08X}h {state}", Error::Cancelled.number());
+    let expected = [
+        (Some(9), 0, cancelled("erased")),
+        (Some(5), 1, cancelled("untouched")),
+        (Some(6), 1, "had".to_owned()),
+    ];
+    assert_eq!(words(&outcomes), expected);
     let plan = planned(&mut bus, &package);
-    assert!(plan.devices.iter().flat_map(|device| &device.steps).all(|step| step.todo == Todo::Update));
+    assert_eq!(steps(&plan), [(5, "drive", "update"), (6, "drive", "has"), (9, "panel", "update")]);
     let outcomes = carried_out(&mut bus, &package, &plan);
     assert!(outcomes.iter().all(|outcome| outcome.result.is_ok()), "{:?}", words(&outcomes));
     assert_eq!(planned(&mut bus, &package).updates(), 0);
+}
+
+/// Neither is the state of one program that of the other, nor is the device said to be unchanged: the second program
+/// is cancelled before it begins, or refused before its first frame (a lift without its password).
+#[test]
+fn a_device_of_which_one_program_was_changed_is_not_called_unchanged() {
+    for (more, stops) in [("", true), (r#", "dialect": "lift""#, false)] {
+        let data = format!(r#""nodes": [5], "program": 2{more}"#);
+        let package = package(&[("drive", r#""nodes": [5]"#), ("data", &data)]);
+        let mut bus = Bus(vec![device(5, 1234)]);
+        let plan = planned(&mut bus, &package);
+        let flag: Arc<AtomicBool> = Arc::default();
+        let options = RunOptions::default().many(ManyOptions::default().cancelled(flag.clone()));
+        let outcomes = run(&mut bus, &package, &plan, &options, &|_, _, event| {
+            flag.fetch_or(stops && matches!(event, Event::Done(_)), Ordering::Relaxed);
+        });
+        assert_eq!(words(&outcomes)[0].2, "updated");
+        let Err(Bad::Failed(failed)) = &outcomes[1].result else { panic!("{:?}", words(&outcomes)) };
+        assert_eq!(failed.left.state, DeviceState::OtherChanged, "{more}");
+        assert_eq!(failed.left.to_string(), "this program of it was not changed, and another one was");
+    }
 }
