@@ -49,12 +49,12 @@ pub(super) fn update(
     Lock::more(url, package.nodes(), &mut locks).map_err(in_use)?;
     let mut plan =
         plan(&mut *adapter, package, &ScanOptions::default().alone(true), cancelled).map_err(unplanned)?;
+    if machine.allow_older {
+        plan.allow_older(|_| true);
+    }
     Lock::more(url, plan.nodes(), &mut locks).map_err(in_use)?;
     for line in plan.to_string().lines() {
         let _ = news.send(News::Phase(line.to_string()));
-    }
-    if machine.allow_older {
-        plan.allow_older(|_| true);
     }
     let all = plan.updates().max(1);
     let percents = Mutex::new(BTreeMap::new());

@@ -63,7 +63,10 @@ impl Agent {
         context.result(words, || json!({ "updated": updated, "failed": failed, "unserved": unserved }));
         match failed + unserved {
             // An agent that was ended is not to blame for what happened in its life.
-            bad if bad > 0 && self.once => Err(Failure::several(Exit::Some, legacy::UNKNOWN, bad, count)),
+            bad if bad > 0 && self.once => {
+                let what = format!("{bad} of {count} devices failed");
+                Err(Failure::several(Exit::Some, legacy::UNKNOWN, what))
+            }
             _ => Ok(()),
         }
     }

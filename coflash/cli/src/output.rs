@@ -312,16 +312,25 @@ impl Failure {
 
     /// Several devices have failed, and the summary has shown the reasons. `legacy` is the exit
     /// code of the manual's tools, which handle one device, for the first failed device.
-    pub(super) fn several(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
-        Self { legacy, ..Self::new(exit, format!("{failed} of {of} devices failed")).shown() }
+    pub(super) fn several(exit: Exit, legacy: u32, what: String) -> Self {
+        Self { legacy, ..Self::new(exit, what).shown() }
     }
 
     /// The end of a command for so many devices, of which these have failed.
     pub(super) fn of_all(failures: &[&Self], of: usize) -> Result<(), Self> {
+        Self::of_each(failures, of, "devices failed")
+    }
+
+    /// The same for the programs of a package: a device may have several, and an older one has not failed.
+    pub(super) fn of_programs(failures: &[&Self], of: usize) -> Result<(), Self> {
+        Self::of_each(failures, of, "programs are not in their devices")
+    }
+
+    fn of_each(failures: &[&Self], of: usize, what: &str) -> Result<(), Self> {
         let Some(first) = failures.first() else { return Ok(()) };
         let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
         let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
-        Err(Self::several(exit, first.legacy, failures.len(), of))
+        Err(Self::several(exit, first.legacy, format!("{} of {of} {what}", failures.len())))
     }
 
     /// Nothing on the bus is a device that a package is for.

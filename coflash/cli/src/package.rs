@@ -13,7 +13,8 @@ use coflash_core::device::scan::ScanOptions;
 use coflash_core::file::inspect::Date;
 use coflash_core::file::limit;
 use coflash_core::machine::{
-    self, kind, version, Bad, Good, Outcome, Package, Plan, PlanError, Recipe, RunOptions, Signer, Todo,
+    self, kind, version, Bad, DeviceFault, Good, Outcome, Package, Plan, PlanError, Recipe, RunOptions,
+    Signer, Todo,
 };
 use coflash_core::update::many::ManyOptions;
 use coflash_core::update::FlashOptions;
@@ -354,10 +355,10 @@ impl Machine {
             PlanError::Package(fault) => Failure::package(path, &fault),
         })?;
         drop(waiting);
-        out.say(plan.to_string().trim_end());
         if self.allow_older {
             plan.allow_older(|_| true);
         }
+        out.say(plan.to_string().trim_end());
         if plan.updates() > 0 {
             self.confirm(context, &plan)?;
         }
@@ -449,6 +450,7 @@ fn summary(
                 ("updated", report.to_string())
             }
             Err(bad) => {
+                let is_older = matches!(bad, Bad::Left(DeviceFault::Older { .. }));
                 let failure = match bad {
                     Bad::Left(fault) => Failure::of_device(&fault),
                     Bad::Failed(failed) => Failure::from(failed.error).leaving(Some(failed.left)),
@@ -456,7 +458,7 @@ fn summary(
                 value["error"] = failure.value()["error"].take();
                 let words = failure.to_string().trim_end().to_owned();
                 failures.push(failure);
-                ("failed", words)
+                (if is_older { "older" } else { "failed" }, words)
             }
         };
         // Of another machine, the plan has said it.
@@ -466,13 +468,13 @@ fn summary(
         value["state"] = state.into();
         devices.push(value);
     }
-    let failed = failures.len();
-    out.say(format_args!("{} of {all} programs are in their devices", all - failed));
+    out.say(format_args!("{} of {all} programs are in their devices", all - failures.len()));
+    let failed = devices.iter().filter(|value| value["state"] == "failed").count();
     let mut document = json!({ "command": "flash", "devices": devices, "failed": failed });
     (document["package"], document["foreign"]) = (path.display().to_string().into(), json!(plan.foreign));
     let result = match all {
         0 => Err(Failure::no_device_for(path).within(&mut document)),
-        _ => Failure::of_all(&failures.iter().collect::<Vec<_>>(), all),
+        _ => Failure::of_programs(&failures.iter().collect::<Vec<_>>(), all),
     };
     end(out, &mut document, report, result)
 }

@@ -16,6 +16,31 @@ pub enum Front {
     Page,
 }
 
+/// The number of a program in a sentence, which says nothing of the first one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OfProgram(pub u8);
+
+/// What a sentence names, in the words of a front.
+trait Named {
+    fn named(&self, front: Front) -> String;
+}
+
+impl<T: Display> Named for T {
+    fn named(&self, _: Front) -> String {
+        self.to_string()
+    }
+}
+
+impl Named for OfProgram {
+    fn named(&self, front: Front) -> String {
+        match front {
+            _ if self.0 == 1 => String::new(),
+            Front::Terminal => format!(" --program {}", self.0),
+            Front::Page => format!(" with {} in the field Program", self.0),
+        }
+    }
+}
+
 /// Defines [`Advice`] by a table: what each one is for, and its sentence.
 macro_rules! advice {
     ($($(#[$doc:meta])+ $name:ident $({ $field:ident: $kind:ty })? => $sentence:literal,)+) => {
@@ -36,7 +61,7 @@ macro_rules! advice {
                 match self {
                     $(Self::$name $({ $field })? => {
                         let words = of_front($sentence, front);
-                        $(let words = words.replace(concat!("{", stringify!($field), "}"), &$field.to_string());)?
+                        $(let words = words.replace(concat!("{", stringify!($field), "}"), &$field.named(front));)?
                         words
                     })+
                 }
@@ -459,29 +484,32 @@ advice! {
     /// For a file that is no program.
     IsRefused => "[coflash flash|an update] refuses it",
     /// For a program that is left unreleased.
-    ReleaseIt => "[coflash start tries the program, coflash more release releases it|More … at the device has \
-        Start the program, which tries it, and Release for autostart]",
+    ReleaseIt { program: OfProgram } => "[coflash start{program} tries the program, coflash more \
+        release{program} releases it|More … at the device{program} has Start the program, which tries it, and Release for autostart]",
     /// For a program that waits after a call.
-    StartIt => "[coflash start|Start the program, in More … at the device,] starts it again",
+    StartIt { program: OfProgram } => "[coflash start{program}|Start the program{program}, in More … at the \
+        device,] starts it again",
     /// For a device whose next reset starts its program.
-    StartNow => "[coflash start|Start the program, in More … at the device,] starts the program now",
+    StartNow { program: OfProgram } => "[coflash start{program}|Start the program{program}, in More … at the \
+        device,] starts the program now",
     /// For an entry strap that is set.
     ReleaseStrap => "release the entry strap (a button or a jumper of the board), then reset the device",
     /// For a program that has crashed too often.
-    CrashLoop => "find out why the program ends; [coflash start|Start the program, in More … at the device,] \
-        starts it again and counts anew",
+    CrashLoop { program: OfProgram } => "find out why the program ends; [coflash start{program}|Start the \
+        program{program}, in More … at the device,] starts it again and counts anew",
     /// For a product without autostart.
-    StartByCommand => "[coflash start|Start the program, in More … at the device,] starts the program; this \
-        product waits for that after each reset",
+    StartByCommand { program: OfProgram } => "[coflash start{program}|Start the program{program}, in More … \
+        at the device,] starts the program; this product waits for that after each reset",
     /// For a bootloader that had a fault.
-    BootloaderFault => "[coflash start|Start the program, in More … at the device,] starts the program now; if \
-        the fault happens again, [send a report (coflash more report) to|ask] the maker of the bootloader",
+    BootloaderFault { program: OfProgram } => "[coflash start{program}|Start the program{program}, in More … \
+        at the device,] starts the program now; if the fault happens again, [send a report (coflash more report) to|ask] the maker of the bootloader",
     /// For a device that was asked in its rescue window.
-    AskedInWindow => "[coflash start|Start the program, in More … at the device,] starts the program now; let \
-        masters wait until its boot-up before they ask the device",
+    AskedInWindow { program: OfProgram } => "[coflash start{program}|Start the program{program}, in More … at \
+        the device,] starts the program now; let masters wait until its boot-up before they ask the device",
     /// For a trial of a bootloader.
-    RenewalOpen => "look at the line \"bootloader\": on trial it is confirmed by [coflash flash|an update] with \
-        its file; after a trial [coflash start|Start the program, in More … at the device,] starts the program",
+    RenewalOpen { program: OfProgram } => "look at the line \"bootloader\": on trial it is confirmed by \
+        [coflash flash|an update] with its file; after a trial [coflash start{program}|Start the \
+        program{program}, in More … at the device,] starts the program",
     /// For a device that compacts its stored values.
     Compacts => "wait for a second: the program starts by itself",
     /// For a bootloader on trial.

@@ -23,13 +23,18 @@ pub(super) fn of_file(error: &FileError) -> String {
 
 #[cfg(test)]
 mod tests {
+    use coflash_core::advice::OfProgram;
+
     use super::*;
 
     #[test]
     fn a_text_with_advice_gets_the_words_of_the_page() {
-        let text = format!("it waits: {}", Advice::StartIt);
-        let words = with_advice(text, Some(Advice::StartIt));
+        let start = |number| Advice::StartIt { program: OfProgram(number) };
+        let words = with_advice(format!("it waits: {}", start(1)), Some(start(1)));
         assert_eq!(words, "it waits: Start the program, in More … at the device, starts it again");
+        let second = with_advice(start(2), Some(start(2)));
+        assert!(second.starts_with("Start the program with 2 in the field Program, in More"), "{second}");
+        assert_eq!(start(2).to_string(), "coflash start --program 2 starts it again");
         assert_eq!(with_advice("it waits", None), "it waits");
     }
 }

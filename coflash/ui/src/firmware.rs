@@ -11,7 +11,7 @@ use super::state::{Firmware, Notice, Seal, Settings};
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{ram_image, Program, Target};
-use coflash_core::update::{self, ContentFault, Judging, Payload, Reading};
+use coflash_core::update::{self, ContentFault, Judging, Marks, Payload, Reading};
 
 /// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
@@ -41,7 +41,9 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     let size = bytes.len();
     let shown = match &read.payload {
         Payload::Program(program) => of_program(program, &read, size, name),
-        Payload::Sealed(file) if !read.payload.is_bootloader() => of_sealed(file, size, name),
+        Payload::Sealed(file) if !read.payload.is_bootloader() => {
+            of_sealed(file, read.payload.marks(), size, name)
+        }
         new => of_bootloader(new, size, name),
     };
     Ok(Loaded { bytes, program: read.payload, shown })
@@ -76,6 +78,7 @@ fn of_program(program: &Program, read: &update::Loaded, size: usize, name: Strin
         inspection: inspection.map(|it| advice::with_advice(it, it.advice())).unwrap_or_default(),
         program_size: program.size(),
         crc: program.crc(),
+        marks: read.payload.marks(),
         vendor_id: label.as_ref().map(|label| label.0),
         product_code: label.as_ref().map(|label| label.1),
         version: inspection
@@ -100,6 +103,7 @@ fn of_bootloader(new: &Payload, size: usize, name: String) -> Firmware {
         ),
         program_size: new.size(),
         crc: new.crc(),
+        marks: new.marks(),
         vendor_id: target.map(|target| target.vendor_id),
         product_code: target.map(|target| target.product_code),
         version,
@@ -111,13 +115,14 @@ fn of_bootloader(new: &Payload, size: usize, name: String) -> Firmware {
 }
 
 /// A sealed image. Only the device's keys decrypt it.
-fn of_sealed(file: &SealedFile, size: usize, name: String) -> Firmware {
+fn of_sealed(file: &SealedFile, marks: Marks, size: usize, name: String) -> Firmware {
     let (head, sealed, target) = (file.head(), file.parts(), file.target());
     Firmware {
         size,
         inspection: sealed.to_string(),
         program_size: head.size(),
         crc: head.crc(),
+        marks,
         vendor_id: Some(target.vendor_id),
         product_code: Some(target.product_code),
         version: Some(ProgramVersion(head.version()).to_string()),

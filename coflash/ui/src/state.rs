@@ -16,8 +16,9 @@ use coflash_core::device::lss::LssAddress;
 use coflash_core::device::scan::Found;
 use coflash_core::device::state::supply;
 use coflash_core::device::Error;
+use coflash_core::machine::EVERY_VERSION_HAS_THIS_CRC;
 use coflash_core::update::many::Failed;
-use coflash_core::update::{self, DeviceState, Event};
+use coflash_core::update::{self, DeviceState, Event, Installed, Marks};
 
 /// The most reports; the oldest are dropped first.
 const REPORTS: usize = 500;
@@ -145,6 +146,9 @@ pub(super) struct Program {
     pub(super) crc: Option<u32>,
     /// The state (none, stopped or running) and the flash status.
     pub(super) words: String,
+    /// What the device reports of it.
+    #[serde(skip)]
+    info: ProgramInfo,
 }
 
 /// The comparison of a file with a device.
@@ -173,6 +177,9 @@ pub(super) struct Firmware {
     /// Bytes of the program in flash.
     pub(super) program_size: u32,
     pub(super) crc: u32,
+    /// What a device reports that has it.
+    #[serde(skip)]
+    pub(super) marks: Marks,
     pub(super) vendor_id: Option<u32>,
     pub(super) product_code: Option<u32>,
     pub(super) version: Option<String>,
@@ -324,7 +331,7 @@ impl State {
     pub(super) fn recall(&mut self, nodes: &[NodeId], results: &mut [Result<update::Report, Failed>]) {
         for (node, result) in nodes.iter().map(|node| node.get()).zip(results) {
             match result {
-                Err(Failed { left, .. }) => left.state = self.left(node, left.state),
+                Err(Failed { left, .. }) => *left = left.after(self.left(node, left.state)),
                 Ok(_) => drop(self.known.remove(&node)),
             }
         }
@@ -378,7 +385,7 @@ impl Device {
             security: info.security.clone(),
             state: info.state.map(|state| state.to_string()),
             last_reset: info.state.and_then(|state| state.last_reset()),
-            advice: info.state.and_then(|state| state.advice()).map(|advice| advice::on_page(&advice)),
+            advice: info.advice().map(|advice| advice::on_page(&advice)),
             supply: info.state.and_then(|state| supply(state.supply)),
             option_bytes: option_bytes.map(|bytes| bytes.to_string()),
             warnings: option_bytes.map_or(Vec::new(), |bytes| bytes.warnings()),
@@ -396,9 +403,9 @@ impl Device {
         }
     }
 
-    /// The CRC of one of its programs.
-    pub(super) fn crc(&self, number: u8) -> Option<u32> {
-        self.programs.iter().find(|program| program.number == number).and_then(|program| program.crc)
+    /// One of its programs.
+    pub(super) fn program(&self, number: u8) -> Option<&Program> {
+        self.programs.iter().find(|program| program.number == number)
     }
 }
 
@@ -431,7 +438,7 @@ impl Program {
         if let Some(released) = info.released {
             words += if released { ", released" } else { ", not released" };
         }
-        Self { number: info.number, crc: info.crc, words }
+        Self { number: info.number, crc: info.crc, words, info: *info }
     }
 }
 
@@ -443,6 +450,8 @@ impl Firmware {
             (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
             _ => None,
         };
+        let has = device.program(number).filter(|_| !self.is_bootloader);
+        let has = has.map_or(Installed::Other, |program| self.marks.compare(&program.info));
         match (target, device.product()) {
             (Some((file, _)), Some((own, _))) if file != own => {
                 verdict(Fits::No, format!("made for vendor-ID {file:08X}h, this device has {own:08X}h"))
@@ -454,9 +463,8 @@ impl Firmware {
                 Some(_) => verdict(Fits::Yes, "a bootloader for this product".to_string()),
                 None => verdict(Fits::Unknown, "the device does not report its bootloader".to_string()),
             },
-            _ if !self.is_bootloader && device.crc(number) == Some(self.crc) => {
-                verdict(Fits::Yes, "in the device already (same CRC)".to_string())
-            }
+            _ if has == Installed::This => verdict(Fits::Yes, "in the device already (same CRC)".to_string()),
+            _ if has == Installed::Unknown => verdict(Fits::Unknown, EVERY_VERSION_HAS_THIS_CRC.to_string()),
             (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
             (None, _) => verdict(Fits::Unknown, "the file does not name its target device".to_string()),
             (_, None) => verdict(Fits::Unknown, "the device does not report its product".to_string()),
@@ -524,7 +532,44 @@ pub(super) fn may_be_of(known: Option<u32>, now: Option<u32>) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use coflash_core::device::scan::{scan, ScanOptions};
+    use kit::fake::{Bus, Fake, Maker, APPLICATION};
+
     use super::*;
+
+    /// Vendor-ID, product code, and 2005h.
+    struct Version(u32);
+
+    impl Maker for Version {
+        fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+            let value = match at {
+                (0x1018, 1) => 63,
+                (0x1018, 2) => 1234,
+                (0x2005, 1) => self.0,
+                _ => return None,
+            };
+            Some(Ok(value.to_le_bytes().to_vec()))
+        }
+    }
+
+    /// The same CRC with another version is another program; the file is V1.10r100 (expected.py).
+    #[test]
+    fn a_crc_alone_does_not_say_that_a_device_has_the_program() {
+        let bytes = include_bytes!("../../core/tests/data/release-110.blk").to_vec();
+        let load = crate::firmware::load(bytes.into(), "a.blk", &Settings::default());
+        let file = load.unwrap_or_else(|notice| panic!("{}", notice.words)).shown;
+        for (version, is_there) in [(0x0064_0A01, true), (0, true), (0x0065_0A01, false)] {
+            let mut fake = Fake::new(APPLICATION);
+            fake.crc_of_application = Some(file.crc);
+            fake.maker = Some(Box::new(Version(version)));
+            let found = scan(&mut Bus(vec![fake]), &ScanOptions::default(), &Arc::default()).unwrap();
+            let info = found.values().find_map(|found| found.info.as_ref()).unwrap();
+            let words = file.against(&Device::of(info), 1).words;
+            assert_eq!(words.contains("already"), is_there, "{version:08X}h: {words}");
+        }
+    }
 
     /// Another device at the node has lost nothing; one without an answer may be that of before.
     #[test]

@@ -239,7 +239,10 @@ fn report(
                 device: device.as_ref().and_then(|device| device.name.clone()),
                 serial_number: device.as_ref().and_then(|device| device.identity[3]),
                 file: file.shown.name.clone(),
-                crc: device.as_ref().filter(|device| device.answers).and_then(|device| device.crc(program)),
+                crc: device
+                    .as_ref()
+                    .filter(|device| device.answers)
+                    .and_then(|device| device.program(program)?.crc),
                 file_crc: file.shown.crc,
                 version: device.filter(|device| device.answers).and_then(|device| device.software),
                 file_version: file.shown.version.clone(),
@@ -308,7 +311,7 @@ fn assign(
         });
     }
     if let Some(rate) = bit_rate.and_then(BitRate::bits_per_second) {
-        words.push(format!("it switches to {} kbit/s at its next start", rate / 1000));
+        words.push(of_bit_rate(rate / 1000, store));
     }
     words
         .push(if store { "stored" } else { "not stored: the setting is lost at the next start" }.to_string());
@@ -317,6 +320,14 @@ fn assign(
         read_again(link, shared, node);
     }
     Ok(Notice::done(words.join("; ")))
+}
+
+/// What becomes of a bit rate: without being stored, it is not there any more at the next start.
+fn of_bit_rate(rate: u32, is_stored: bool) -> String {
+    match is_stored {
+        true => format!("it switches to {rate} kbit/s at its next start"),
+        false => format!("it is given {rate} kbit/s, and does not switch to it yet"),
+    }
 }
 
 /// Sends the settings to the selected device; returns its previous node-ID.
@@ -337,4 +348,15 @@ fn give(
         master.store()?;
     }
     Ok(old)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bit_rate_that_is_not_stored_is_not_that_of_the_next_start() {
+        let words = [true, false].map(|is_stored| of_bit_rate(500, is_stored).contains("at its next start"));
+        assert_eq!(words, [true, false]);
+    }
 }

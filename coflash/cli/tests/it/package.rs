@@ -11,7 +11,7 @@ use coflash_core::machine::{make, Identity, Package, Part, Recipe};
 
 use crate::sealing::Room;
 use crate::tool::{coflash, command, data, folder, run, Done};
-use kit::fake::{serve, Fake, APPLICATION};
+use kit::fake::{serve, Fake, Maker, APPLICATION};
 use kit::folder::Folder;
 use serde_json::{json, Value};
 
@@ -279,6 +279,42 @@ fn what_contradicts_a_package_is_refused() {
         ["ui", "--service", package, "--no-open", "--port", &port, "--report-dir", &line.at("reports")];
     let told = ["the adapter is chosen anew at each start", "make that folder writable", "cannot be served"];
     run(command().env("XDG_STATE_HOME", &root).args(words)).fails(1, &told);
+}
+
+/// Vendor-ID, product code, and 2005h.
+struct Version(u32);
+
+impl Maker for Version {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        let value = match at {
+            (0x1018, 1) => 63,
+            (0x1018, 2) => 1234,
+            (0x2005, 1) => self.0,
+            _ => return None,
+        };
+        Some(Ok(value.to_le_bytes().to_vec()))
+    }
+}
+
+/// The device has V1.10r101, and the package V1.10r100 (expected.py): left out, it has not failed; allowed, the plan
+/// says that it is written.
+#[test]
+fn an_older_program_has_not_failed_and_the_plan_says_what_is_done() {
+    let folder = folder("package-older");
+    fs::copy(data("release-110.blk"), folder.join("b.blk")).unwrap();
+    folder.file("line.toml", b"[[program]]\nimage = 'b.blk'\nnodes = [5]\n");
+    coflash(&["package", &folder.path("line.toml")]).good();
+    let flash = |more: &str| {
+        let mut fake = Fake::new(APPLICATION);
+        fake.maker = Some(Box::new(Version(0x0065_0A01)));
+        let (url, _device) = serve(fake);
+        coflash(&["--bus", &url, "flash", &folder.path("line.cpk"), "--yes", more])
+    };
+    flash("--verbose").fails(8, &["error: 1 of 1 programs are not in their devices\n"]);
+    let left = flash("--json").json();
+    assert_eq!((&left["devices"][0]["state"], &left["failed"]), (&json!("older"), &json!(0)), "{left:#}");
+    flash("--allow-older")
+        .says(&["-> V1.10r100, which is older\n", "1 of 1 programs are in their devices\n"]);
 }
 
 /// A run that was killed has left what it had begun, in its report or in the folder of the reports:

@@ -17,6 +17,7 @@ use super::recognise::recognise;
 use super::renewal::{self, Bootloader};
 use super::session::Session;
 use super::state::{supply, BootloaderState};
+use crate::advice::Advice;
 use crate::json;
 
 /// What a device reports about itself; `None` for an object that it does not have.
@@ -124,6 +125,19 @@ impl ProgramInfo {
     #[must_use]
     pub fn release(&self) -> Option<ProgramVersion> {
         self.version.filter(|version| *version != 0).map(ProgramVersion)
+    }
+}
+
+impl DeviceInfo {
+    /// What to do with a device that is in its bootloader, if that is known.
+    #[must_use]
+    pub fn advice(&self) -> Option<Advice> {
+        let has_one = |program: &&ProgramInfo| program.state() != Some(ProgramState::Absent);
+        let mut programs = self.programs.iter().filter(has_one);
+        let any = programs.clone().next();
+        // What starts is one that is released, and of a single one nothing else can be meant.
+        let program = programs.find(|program| program.released == Some(true)).or(any);
+        self.state?.advice(program.map_or(1, |program| program.number))
     }
 }
 
@@ -273,7 +287,7 @@ impl fmt::Display for DeviceInfo {
             if let Some(words) = state.last_reset() {
                 writeln!(f, "  {:<17} {words}", "last reset")?;
             }
-            if let Some(advice) = state.advice() {
+            if let Some(advice) = self.advice() {
                 writeln!(f, "  {:<17} {advice}", "what to do")?;
             }
             if let Some(words) = supply(state.supply) {

@@ -10,7 +10,7 @@ use shared_abi::renewal::TrialEnd;
 use shared_abi::warm_start::Damage;
 
 use super::option_bytes::OptionBytes;
-use crate::advice::Advice;
+use crate::advice::{Advice, OfProgram};
 
 /// Why a device stays in the bootloader, and how its program ended. `Display` shows what is so now in one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -84,22 +84,23 @@ impl BootloaderState {
         by.unwrap_or_default() + &resets
     }
 
-    /// What to do; `None` for a reason that this tool does not know.
+    /// What to do, with this program; `None` for a reason that this tool does not know.
     #[must_use]
-    pub fn advice(self) -> Option<Advice> {
+    pub fn advice(self, program: u8) -> Option<Advice> {
+        let program = OfProgram(program);
         let has_passed = self.reason == STATE_STARTS;
         Some(match Reason::from_byte(if has_passed { self.stayed() } else { self.reason })? {
-            Reason::Fault => Advice::BootloaderFault,
-            Reason::Rescue => Advice::AskedInWindow,
-            Reason::Renewal => Advice::RenewalOpen,
+            Reason::Fault => Advice::BootloaderFault { program },
+            Reason::Rescue => Advice::AskedInWindow { program },
+            Reason::Renewal => Advice::RenewalOpen { program },
             Reason::Compaction => Advice::Compacts,
-            _ if has_passed => Advice::StartNow,
-            Reason::Requested | Reason::TwoResets => Advice::StartNow,
+            _ if has_passed => Advice::StartNow { program },
+            Reason::Requested | Reason::TwoResets => Advice::StartNow { program },
             Reason::Strap => Advice::ReleaseStrap,
-            Reason::CrashLoop => Advice::CrashLoop,
-            Reason::NoAutostart => Advice::StartByCommand,
+            Reason::CrashLoop => Advice::CrashLoop { program },
+            Reason::NoAutostart => Advice::StartByCommand { program },
             Reason::NodeId => Advice::NodeIdForProduct,
-            Reason::Unsigned => Advice::ReleaseIt,
+            Reason::Unsigned => Advice::ReleaseIt { program },
             Reason::NoProgram => Advice::FlashFirst,
             Reason::Damaged => Advice::FlashAgain,
             Reason::Vectors => Advice::WrongFormat,
@@ -280,18 +281,19 @@ mod tests {
             all.dedup();
             assert_eq!(all.len(), Reason::ALL.len());
         }
+        let program = OfProgram(2);
         for (now, last, advice) in [
-            (255, 0, Advice::StartNow),
-            (255, 5, Advice::StartNow),
-            (255, 7, Advice::BootloaderFault),
-            (255, 8, Advice::AskedInWindow),
-            (5, 8, Advice::ReleaseIt),
+            (255, 0, Advice::StartNow { program }),
+            (255, 5, Advice::StartNow { program }),
+            (255, 7, Advice::BootloaderFault { program }),
+            (255, 8, Advice::AskedInWindow { program }),
+            (5, 8, Advice::ReleaseIt { program }),
             (1, 0, Advice::ReleaseStrap),
         ] {
             let state = BootloaderState { reason: now, last_reason: Some(last), ..NOTHING };
-            assert_eq!(state.advice(), Some(advice), "{now} after {last}");
+            assert_eq!(state.advice(2), Some(advice), "{now} after {last}");
         }
-        let of = |reason| BootloaderState { reason, ..NOTHING }.advice();
+        let of = |reason| BootloaderState { reason, ..NOTHING }.advice(1);
         assert!(Reason::ALL.iter().all(|reason| of(*reason as u8).is_some()) && of(200).is_none());
     }
 }

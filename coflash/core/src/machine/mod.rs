@@ -19,7 +19,10 @@ pub mod zip;
 pub use self::fault::{DeviceFault, Fault, Limit, SignatureFault};
 pub use self::manifest::{Entry, Identity, Manifest};
 pub use self::package::{is_package, kind, looks_like, make, version, Package, Part, FRONT};
-pub use self::plan::{matched, plan, Device, Foreign, Missing, Plan, PlanError, Step, Stranger, Todo};
+pub use self::plan::{
+    matched, plan, Device, Foreign, Missing, Plan, PlanError, Step, Stranger, Todo,
+    EVERY_VERSION_HAS_THIS_CRC,
+};
 pub use self::recipe::{Recipe, RecipeDevice, RecipeFault, Row};
 pub use self::run::{run, Bad, Good, Outcome, RunOptions};
 pub use self::signature::Signer;

@@ -74,6 +74,8 @@ pub struct Step {
     /// Whether the device reports the CRC of the program, and that is the CRC of each of its versions: the program
     /// is written, because nobody knows whether the device has it.
     pub every_version_has_this_crc: bool,
+    /// Whether the device has a newer version.
+    pub older: bool,
 }
 
 /// What is to be done with a program of a device.
@@ -273,6 +275,7 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
         }
         let (from, to) = versions(info, entry, program);
         let every_version_has_this_crc = installed == Installed::Unknown && todo == Todo::Update;
+        let older = todo == Todo::Older;
         steps.push(Step {
             entry: at,
             program: entry.name.clone(),
@@ -280,6 +283,7 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
             to,
             todo,
             every_version_has_this_crc,
+            older,
         });
     }
     // A package may have a program for each device that can be at a node.
@@ -406,8 +410,8 @@ impl fmt::Display for Stranger {
 }
 
 /// Why a program is written whose CRC the device reports.
-const EVERY_VERSION_HAS_THIS_CRC: &str =
-    "warning: each version of this program may have this CRC, because it has a CRC-32 of \
+pub const EVERY_VERSION_HAS_THIS_CRC: &str =
+    "each version of this program may have this CRC, because it has a CRC-32 of \
      its own: nobody knows whether the device has it, so it is written";
 
 impl fmt::Display for Plan {
@@ -418,17 +422,18 @@ impl fmt::Display for Plan {
         for device in &self.devices {
             let serial =
                 device.identity[3].map_or(String::new(), |serial| format!(" (serial number {serial:08X}h)"));
-            for Step { program, from, to, todo, every_version_has_this_crc, .. } in &device.steps {
+            for Step { program, from, to, todo, every_version_has_this_crc, older, .. } in &device.steps {
                 write!(f, "node {}: {program}: ", device.node)?;
                 let from = from.as_deref().unwrap_or("no program");
                 match todo {
                     Todo::Has => writeln!(f, "it has {to}{serial}")?,
+                    Todo::Update if *older => writeln!(f, "{from} -> {to}, which is older{serial}")?,
                     Todo::Update => writeln!(f, "{from} -> {to}{serial}")?,
                     Todo::Older => writeln!(f, "it has {from}, and {to} is older: not written{serial}")?,
                     Todo::Leave(fault) => writeln!(f, "is not written: {fault}")?,
                 }
                 if *every_version_has_this_crc {
-                    writeln!(f, "  {}", EVERY_VERSION_HAS_THIS_CRC)?;
+                    writeln!(f, "  warning: {EVERY_VERSION_HAS_THIS_CRC}")?;
                 }
             }
         }

@@ -65,7 +65,7 @@ fn ask(session: &mut Session<'_>, number: u8, wrote: bool) -> Result<Answers, Er
     let mut object = |index| reported(session.read_number(Address::new(index, number)));
     let control = object(program::PROGRAM_CONTROL)?;
     let crc = object(program::PROGRAM_ID)?;
-    Ok(Answers { running, control, crc })
+    Ok(Answers { running, program: number, control, crc })
 }
 
 /// Whether a sealed image was refused as not authentic, too old, or for other keys: a device erases
@@ -149,6 +149,7 @@ mod tests {
         ] {
             let answers = Answers {
                 running: DeviceType(0),
+                program: 1,
                 control: Some(ProgramState::Running as u32),
                 crc: Some(crc),
             };

@@ -5,7 +5,7 @@ use std::fmt;
 use canopen::program::ProgramState;
 use serde::{Serialize, Serializer};
 
-use crate::advice::Advice;
+use crate::advice::{Advice, OfProgram};
 use crate::device::DeviceType;
 
 /// The contents of a device after a failed procedure.
@@ -31,6 +31,8 @@ pub enum DeviceState {
     Unreleased,
     /// The new program is complete and released for autostart.
     Released,
+    /// The new bootloader is installed, and the program is unchanged.
+    Renewed,
 }
 
 impl DeviceState {
@@ -47,6 +49,7 @@ impl DeviceState {
             Self::Written => "written",
             Self::Unreleased => "unreleased",
             Self::Released => "released",
+            Self::Renewed => "renewed",
         }
     }
 }
@@ -61,10 +64,9 @@ impl fmt::Display for DeviceState {
             Self::Postponed => "it was told to erase its program, and has acknowledged nothing of the new one: it may have the old one",
             Self::Erased => "it contains no complete program",
             Self::Written => "it contains the new program, which starts after a reset",
-            Self::Unreleased => {
-                "it contains the new program, not released for autostart: after a reset the bootloader waits for the next attempt"
-            }
+            Self::Unreleased => "it contains the new program, not released for autostart",
             Self::Released => "it contains the new program, released for autostart",
+            Self::Renewed => "it has the new bootloader, and its program is unchanged",
         })
     }
 }
@@ -100,6 +102,9 @@ pub struct Answers {
     /// 1000h.
     #[serde(flatten)]
     pub running: DeviceType,
+    /// The number of the program.
+    #[serde(skip)]
+    pub program: u8,
     /// 1F51h of the program, if the object exists.
     pub control: Option<u32>,
     /// 1F56h of the program, if the object exists.
@@ -124,7 +129,7 @@ impl DeviceAfterUpdate {
     pub fn advice(&self) -> Option<Advice> {
         let DeviceAnswer::Given(answers) = self.answer else { return None };
         let waits = self.state == DeviceState::Called && answers.running.is_bootloader() && !answers.empty();
-        waits.then_some(Advice::StartIt)
+        waits.then_some(Advice::StartIt { program: OfProgram(answers.program) })
     }
 }
 

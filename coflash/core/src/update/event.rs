@@ -13,7 +13,7 @@ pub use super::device_after::{DeviceAfterUpdate, DeviceState};
 pub use super::phase::{Note, Phase, Warning};
 pub use super::report::Report;
 pub use super::retry::{RepeatReason, Retry};
-use crate::advice::Advice;
+use crate::advice::{Advice, OfProgram};
 use crate::device::{DeviceType, Error};
 use crate::json;
 
@@ -121,7 +121,9 @@ impl Event {
     #[must_use]
     pub fn advice(&self) -> Option<Advice> {
         match self {
-            Self::Phase(Phase::NotReleased) => Some(Advice::ReleaseIt),
+            Self::Phase(Phase::NotReleased { program }) => {
+                Some(Advice::ReleaseIt { program: OfProgram(*program) })
+            }
             Self::Done(done) if done.report.is_none() => done.left.advice(),
             _ => None,
         }

@@ -7,7 +7,7 @@ use canopen::NodeId;
 use coboot_can::Losses;
 use serde::Serialize;
 
-use crate::advice::Advice;
+use crate::advice::{Advice, OfProgram};
 use crate::device::info::Nameplate;
 use crate::device::session::Silence;
 use crate::device::{DeviceType, Dialect};
@@ -61,7 +61,10 @@ pub enum Phase {
     /// Step 14: the program is released for autostart (83h).
     Released,
     /// The program is not released for autostart, because it is not to be started.
-    NotReleased,
+    NotReleased {
+        /// Its number.
+        program: u8,
+    },
     /// Step 15: the program starts.
     Starting,
     /// The update does not take place: the program that was called back starts again.
@@ -218,12 +221,9 @@ impl fmt::Display for Phase {
                 write!(f, "the trial was successful: {running} started and returned to the bootloader")
             }
             Self::Released => f.write_str("released for autostart (83h)"),
-            Self::NotReleased => {
-                write!(
-                    f,
-                    "not released for autostart: the device stays in the bootloader; {}",
-                    Advice::ReleaseIt
-                )
+            Self::NotReleased { program } => {
+                let advice = Advice::ReleaseIt { program: OfProgram(*program) };
+                write!(f, "not released for autostart; {advice}")
             }
             Self::Starting => f.write_str("starting the program"),
             Self::StartingAgain => {

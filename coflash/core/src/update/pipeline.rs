@@ -165,6 +165,7 @@ fn procedure(
         program_size,
         program_crc,
         device_crc: update.verified,
+        tried: update.tried,
         repeats,
         took,
         transfer,

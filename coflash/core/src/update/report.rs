@@ -22,6 +22,9 @@ pub struct Report {
     /// The CRC that the device has reported of it (1F56h), which may be a CRC-16; `None` if it was not asked.
     #[serde(skip)]
     pub device_crc: Option<u32>,
+    /// Whether the program has passed its trial run.
+    #[serde(skip)]
+    pub tried: bool,
     /// Blocks that had to be sent again.
     #[serde(rename = "blocks_repeated")]
     pub repeats: u32,

@@ -90,6 +90,8 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) losses: Option<Losses>,
     /// The value of 1F56h, once it was read and is that of the file.
     pub(super) verified: Option<u32>,
+    /// Whether the program has passed its trial run.
+    pub(super) tried: bool,
     /// The NMT mastership, while the tool holds it.
     pub(super) mastership: Option<Mastership>,
     /// The devices with which it gets its data together, as reported.
@@ -117,6 +119,7 @@ impl<'t> RunningUpdate<'t> {
             called: None,
             losses: None,
             verified: None,
+            tried: false,
             mastership: None,
             together: 0,
             disturbed: false,
@@ -193,6 +196,7 @@ impl<'t> RunningUpdate<'t> {
             Event::Phase(Phase::Verified { crc } | Phase::VerifiedAgain { crc }) => {
                 self.verified = Some(*crc)
             }
+            Event::Phase(Phase::TrialPassed(_)) => self.tried = true,
             Event::Note(Note::Together { devices }) if self.together == *devices => return,
             Event::Note(Note::Together { devices }) => self.together = *devices,
             Event::Warning(Warning::GroupDisturbed) if std::mem::replace(&mut self.disturbed, true) => return,

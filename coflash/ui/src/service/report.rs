@@ -176,7 +176,6 @@ impl Report {
             _ => "failed",
         };
         let hex = |part: Option<u32>| part.map_or(String::new(), |part| format!("{part:08X}h"));
-        let trouble = row.trouble.as_ref();
         let mut head = vec![
             Date(*date).to_string(),
             word(row.state).to_owned(),
@@ -184,25 +183,28 @@ impl Report {
             row.name.clone().unwrap_or_default(),
         ];
         head.extend(row.identity.map(hex));
-        let tail = [
-            trouble.and_then(|trouble| trouble.number).map_or(String::new(), |it| format!("0x{it:08X}")),
-            trouble.and_then(|trouble| trouble.detail.clone()).unwrap_or_default(),
-            entered.operator.clone(),
-            entered.order.clone(),
-            entered.device_number.clone(),
-            manifest.name.clone().unwrap_or_default(),
-            manifest.release.clone().unwrap_or_default(),
-            service.file.clone(),
-            adapter.clone(),
-            tool.clone(),
-        ];
+        let tail = |trouble: Option<&Message>| {
+            [
+                trouble.and_then(|trouble| trouble.number).map_or(String::new(), |it| format!("0x{it:08X}")),
+                trouble.and_then(|trouble| trouble.detail.clone()).unwrap_or_default(),
+                entered.operator.clone(),
+                entered.order.clone(),
+                entered.device_number.clone(),
+                manifest.name.clone().unwrap_or_default(),
+                manifest.release.clone().unwrap_or_default(),
+                service.file.clone(),
+                adapter.clone(),
+                tool.clone(),
+            ]
+        };
         let end = [hex(Some(crc)), sha.to_owned(), self.of.signature(Language::En)];
-        let line =
-            |program: [String; 4], sums: [String; 3]| [&head[..], &program, &tail, &sums, &end].concat();
+        let line = |program: [String; 4], trouble: &Option<Message>, sums: [String; 3]| {
+            [&head[..], &program, &tail(trouble.as_ref()), &sums, &end].concat()
+        };
         if let Some(program) = &row.missing {
             let (from, to) = (String::new(), String::new());
             let program = [program.clone(), from, to, word(row.state).to_owned()];
-            return vec![line(program, Default::default())];
+            return vec![line(program, &row.trouble, Default::default())];
         }
         let of_step = |step: &Step| {
             let (from, to) = (step.from.clone().unwrap_or_default(), step.to.clone());
@@ -212,7 +214,7 @@ impl Report {
                 hex(program.map(Payload::crc)),
                 entry.map_or(String::new(), |entry| entry.sha256.clone()),
             ];
-            line([step.program.clone(), from, to, word(step.state).to_owned()], sums)
+            line([step.program.clone(), from, to, word(step.state).to_owned()], &step.trouble, sums)
         };
         row.steps.iter().map(of_step).collect()
     }
@@ -252,11 +254,10 @@ mod tests {
         let step = Step {
             entry: 0,
             program: "drive".to_owned(),
-            from: None,
             to: "1.2".to_owned(),
             state: RowState::Updated,
-            every_version_has_this_crc: false,
             crc: Some(0x2144_DF1C),
+            ..Step::default()
         };
         Row {
             node: Some(node),

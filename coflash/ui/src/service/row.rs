@@ -49,7 +49,7 @@ pub(super) struct Other {
 }
 
 /// A program of a device.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Step {
     #[serde(skip)]
     pub(super) entry: usize,
@@ -62,6 +62,14 @@ pub(super) struct Step {
     /// What the device has reported of it after the update: its CRC (1F56h).
     #[serde(skip)]
     pub(super) crc: Option<u32>,
+    /// Whether it has passed its trial run.
+    #[serde(skip)]
+    pub(super) tried: bool,
+    /// What went wrong with it, and the key of what is in the device after that. The row has the first of its programs.
+    #[serde(skip)]
+    pub(super) trouble: Option<Message>,
+    #[serde(skip)]
+    pub(super) left: Option<&'static str>,
 }
 
 /// The state of a device or of one of its programs.
@@ -107,7 +115,6 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             program: step.program.clone(),
             from: step.from.clone(),
             to: step.to.clone(),
-            crc: None,
             state: match step.todo {
                 Todo::Has => RowState::Has,
                 Todo::Update => RowState::Due,
@@ -115,17 +122,20 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
                 Todo::Leave(_) => RowState::Failed,
             },
             every_version_has_this_crc: step.every_version_has_this_crc,
+            trouble: match &step.todo {
+                // Of another machine it is said once.
+                Todo::Leave(fault) if !plan.is_of_other_machine() => Some(trouble::of_device(fault)),
+                _ => None,
+            },
+            ..Step::default()
         });
+        let steps: Vec<Step> = steps.collect();
         let mut row = Row {
             node: Some(device.node.get()),
             name: device.name.clone(),
             identity: device.identity,
-            steps: steps.collect(),
-            trouble: device.steps.iter().find_map(|step| match &step.todo {
-                // Of another machine it is said once.
-                Todo::Leave(fault) if !plan.is_of_other_machine() => Some(trouble::of_device(fault)),
-                _ => None,
-            }),
+            trouble: steps.iter().find_map(|step| step.trouble.clone()),
+            steps,
             ..Row::default()
         };
         row.sum();
@@ -152,6 +162,14 @@ pub(super) fn others(plan: &Plan) -> Vec<Other> {
         Other { node: node.get(), name, identity, trouble }
     };
     plan.foreign.iter().map(other).collect()
+}
+
+impl Step {
+    /// Whether the device was written, or has begun with that: its identity was compared right before.
+    pub(super) fn is_begun(&self) -> bool {
+        let is_changed = self.left.is_some_and(|left| !matches!(left, "left-untouched" | "left-other"));
+        self.state == RowState::Updated || is_changed
+    }
 }
 
 impl Row {
@@ -200,6 +218,20 @@ impl Row {
         }
     }
 
+    /// What went wrong, each with its program and the key of what is in the device after that; the first one with
+    /// what is known of the device.
+    pub(super) fn troubles(&self) -> Vec<(&str, &Message, Option<&'static str>)> {
+        let steps = self.steps.iter();
+        let mut all: Vec<(&str, &Message, Option<&'static str>)> = steps
+            .filter_map(|step| Some((step.program.as_str(), step.trouble.as_ref()?, step.left)))
+            .collect();
+        match (all.first_mut(), &self.trouble) {
+            (Some(first), _) => first.2 = self.left,
+            (None, trouble) => all.extend(trouble.iter().map(|trouble| ("", trouble, self.left))),
+        }
+        all
+    }
+
     /// Whether an outcome belongs to this row.
     fn is_of(&self, outcome: &Outcome) -> bool {
         self.node.is_some()
@@ -213,37 +245,40 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
     for outcome in outcomes {
         // What is missing has no step, and is known from the plan.
         let Some(row) = rows.iter_mut().find(|row| row.is_of(outcome)) else { continue };
-        let state = match &outcome.result {
+        let Some(step) = row.steps.iter_mut().find(|step| step.entry == outcome.entry) else { continue };
+        step.state = match &outcome.result {
             Ok(Good::Had) => RowState::Has,
             Ok(Good::Updated(report)) => {
-                let crc = report.device_crc.filter(|_| report.renewal.is_none());
-                row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|it| it.crc = crc);
+                step.crc = report.device_crc.filter(|_| report.renewal.is_none());
+                step.tried = report.tried;
                 RowState::Updated
             }
             Err(Bad::Left(DeviceFault::Older { .. })) => RowState::LeftOut,
             Err(bad) => {
+                let (message, left) = trouble::of_outcome(bad);
                 // The first reason counts: the programs after it were not begun.
                 if row.trouble.is_none() {
-                    let (message, left) = trouble::of_outcome(bad);
-                    (row.trouble, row.left) = (Some(message), left);
+                    (row.trouble, row.left) = (Some(message.clone()), left);
                 }
+                (step.trouble, step.left) = (Some(message), left);
                 RowState::Failed
             }
         };
-        row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|step| step.state = state);
         row.sum();
     }
 }
 
 /// The keys of what became of all devices of an update, and of what to do next.
 pub(super) fn headline(rows: &[Row]) -> (&'static str, &'static str) {
-    let has = |state| rows.iter().any(|row| row.state == state);
+    // A device with a program that failed may have got another one.
+    let is_updated = || rows.iter().flat_map(|row| &row.steps).any(|step| step.state == RowState::Updated);
+    let has_failed = rows.iter().any(|row| row.state == RowState::Failed);
     let is_stopped = |row: &Row| row.trouble.as_ref().is_none_or(|why| why.key == "trouble-cancelled");
     match () {
         () if rows.iter().any(|row| row.outcome() == "state-empty") => ("bad-empty", "hint-bad-empty"),
-        () if has(RowState::Failed) && rows.iter().all(is_stopped) => ("stopped", "hint-stopped"),
-        () if has(RowState::Failed) && !has(RowState::Updated) => ("bad-none", "hint-bad"),
-        () if has(RowState::Failed) => ("bad", "hint-bad"),
+        () if has_failed && rows.iter().all(is_stopped) => ("stopped", "hint-stopped"),
+        () if has_failed && !is_updated() => ("bad-none", "hint-bad"),
+        () if has_failed => ("bad", "hint-bad"),
         () if rows.iter().flat_map(|row| &row.steps).any(|step| step.state == RowState::LeftOut) => {
             ("good-part", "hint-good-part")
         }
@@ -279,12 +314,16 @@ impl Known {
                     let known = self.devices.get(&node).filter(|(known, _)| may_be_of(*known, serial));
                     row.left = known.map(|(_, left)| *left).or(row.left);
                 }
-                (RowState::Failed, Some(left)) => {
+                (RowState::Failed, Some(left)) if left != "left-other" => {
                     self.devices.insert(node, (serial, left));
                     self.machine.extend(&serials);
                 }
                 (RowState::Due, _) if !has_program => {}
-                (RowState::Updated | RowState::Has | RowState::Due | RowState::Older, _) => {
+                // A program of it was written.
+                (
+                    RowState::Failed | RowState::Updated | RowState::Has | RowState::Due | RowState::Older,
+                    _,
+                ) => {
                     self.devices.remove(&node);
                 }
                 _ => {}

@@ -69,15 +69,13 @@ pub(super) fn html(report: &Report) -> String {
         ("=adapter", escaped(adapter)),
         ("=tool", escaped(tool)),
         ("=devices", rows.iter().map(|row| text.device(row)).collect()),
-        ("=troubles", rows.iter().filter_map(|row| text.trouble(row)).collect()),
+        ("=troubles", rows.iter().map(|row| text.troubles(row)).collect()),
         ("=programs", service.package.programs().map(program).collect()),
         ("=file", text.of(file)),
-        ("=good", text.good(rows, of, |step, _, _| has_shown_crc(step))),
-        ("=tried", text.good(rows, of, |step, entry, _| is_new(step.state) && entry.trial_run)),
-        (
-            "=sealed",
-            text.good(rows, of, |step, _, it| is_new(step.state) && matches!(it, Payload::Sealed(_))),
-        ),
+        ("=identified", text.good(rows, of, |step, _, _| is_new(step.state).then(|| step.is_begun()))),
+        ("=good", text.good(rows, of, |step, _, _| has_shown_crc(step).then(|| is_there(step)))),
+        ("=tried", text.good(rows, of, |step, entry, _| is_tried(step, entry))),
+        ("=sealed", text.good(rows, of, |step, _, program| is_authentic(step, program))),
     ]
     .into();
     filled(PAGE, |name| values.get(name).cloned().unwrap_or_else(|| text.of(name)))
@@ -86,6 +84,25 @@ pub(super) fn html(report: &Report) -> String {
 /// Whether the program was to be written.
 const fn is_new(state: RowState) -> bool {
     matches!(state, RowState::Updated | RowState::Failed)
+}
+
+/// Whether the program is in its device.
+const fn is_there(step: &Step) -> bool {
+    matches!(step.state, RowState::Updated | RowState::Has)
+}
+
+/// Whether the program has passed its trial; `None` if it had none, which a dialect may not have.
+fn is_tried(step: &Step, entry: &Entry) -> Option<bool> {
+    match step.state {
+        RowState::Updated => step.tried.then_some(true),
+        RowState::Failed => entry.trial_run.then_some(false),
+        _ => None,
+    }
+}
+
+/// Whether the device has taken a sealed program.
+fn is_authentic(step: &Step, program: &Payload) -> Option<bool> {
+    (is_new(step.state) && matches!(program, Payload::Sealed(_))).then(|| is_there(step))
 }
 
 /// A program of the file, with what identifies it.
@@ -128,19 +145,18 @@ impl Text {
         }
     }
 
-    /// How many of the programs that are asked for are in their devices.
-    fn good(self, rows: &[Row], of: &Of, asks: fn(&Step, &Entry, &Payload) -> bool) -> String {
-        let is_asked = |step: &&Step| {
-            let program = of.service.package.programs().nth(step.entry);
-            program.is_some_and(|(entry, program)| asks(step, entry, program))
+    /// Of how many of the programs something is good, among those of which it was asked.
+    fn good(self, rows: &[Row], of: &Of, is_good: fn(&Step, &Entry, &Payload) -> Option<bool>) -> String {
+        let is_good = |step: &Step| {
+            let (entry, program) = of.service.package.programs().nth(step.entry)?;
+            is_good(step, entry, program)
         };
-        let steps: Vec<&Step> = rows.iter().flat_map(|row| &row.steps).filter(is_asked).collect();
-        let good =
-            steps.iter().filter(|step| matches!(step.state, RowState::Updated | RowState::Has)).count();
-        if steps.is_empty() {
+        let asked: Vec<bool> = rows.iter().flat_map(|row| &row.steps).filter_map(is_good).collect();
+        let good = asked.iter().filter(|is_good| **is_good).count();
+        if asked.is_empty() {
             return "–".to_owned();
         }
-        let count = Message::new("report-count").value("count", good).value("all", steps.len());
+        let count = Message::new("report-count").value("count", good).value("all", asked.len());
         escaped(&self.0.message(&count))
     }
 
@@ -176,16 +192,19 @@ impl Text {
         steps.collect()
     }
 
-    fn trouble(self, row: &Row) -> Option<String> {
-        let trouble = row.trouble.as_ref()?;
+    fn troubles(self, row: &Row) -> String {
         let node = row.node.map_or(String::new(), |node| format!(": {} {node}", self.of("node")));
-        let left = row.left.map_or(String::new(), |key| format!(" {}", self.of(key)));
-        Some(format!(
-            "<h3>{}{node}</h3>\n<p>{}{left}</p>\n<p class=\"detail\" lang=\"en\">{}</p>\n",
-            self.of("what-happened"),
-            escaped(&self.0.message(trouble)),
-            escaped(&trouble.original()),
-        ))
+        let trouble = |(program, trouble, left): (&str, &Message, Option<&'static str>)| {
+            let of = if row.steps.len() > 1 { format!(" · {}", escaped(program)) } else { String::new() };
+            let left = left.map_or(String::new(), |key| format!(" {}", self.of(key)));
+            format!(
+                "<h3>{}{node}{of}</h3>\n<p>{}{left}</p>\n<p class=\"detail\" lang=\"en\">{}</p>\n",
+                self.of("what-happened"),
+                escaped(&self.0.message(trouble)),
+                escaped(&trouble.original()),
+            )
+        };
+        row.troubles().into_iter().map(trouble).collect()
     }
 }
 

@@ -99,7 +99,7 @@ fn left(after: DeviceAfterUpdate) -> &'static str {
         DeviceState::Called | DeviceState::Postponed if is_empty => "left-none",
         DeviceState::Untouched => "left-untouched",
         DeviceState::OtherChanged => "left-other",
-        DeviceState::Called => "left-old",
+        DeviceState::Called | DeviceState::Renewed => "left-old",
         DeviceState::Postponed | DeviceState::Begun => "left-unknown",
         DeviceState::Erased => "left-none",
         DeviceState::Written | DeviceState::Unreleased | DeviceState::Released => "left-new",

@@ -211,7 +211,7 @@ mod tests {
         let [five, six, seven] = [5, 6, 7].map(|node| NodeId::new(node).unwrap());
         let step = |entry, todo| {
             let (program, to) = (String::new(), String::new());
-            Step { entry, program, from: None, to, todo, every_version_has_this_crc: false }
+            Step { entry, program, from: None, to, todo, every_version_has_this_crc: false, older: false }
         };
         let device = |(node, todos): (NodeId, [Todo; 2])| {
             let steps = (0..).zip(todos).map(|(entry, todo)| step(entry, todo)).collect();

@@ -607,7 +607,9 @@ fn what_is_known_of_a_device_outlives_its_update() {
             |state: &Value| state["task"].is_null() && state["reports"].as_array().unwrap().len() > number;
         let state = ui.until("the end", ended);
         let words = state["reports"][number]["words"].as_str().unwrap();
+        let before = "this attempt has not changed it; known from before: it contains no complete program";
         assert!(words.contains("it contains no complete program"), "{words}");
+        assert_eq!(words.contains(before), number == 1, "{words}");
     }
 }
 

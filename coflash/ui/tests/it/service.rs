@@ -243,6 +243,34 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     assert_eq!(ui.until("the adapter", |state| state["open"] == true)["adapter"], json!(next));
 }
 
+/// A device gets its first program, in a dialect without a trial, and the second one is refused before its first
+/// frame (a lift without its password): each has its own outcome, and nothing is good that was not done.
+#[test]
+fn each_program_of_a_device_has_its_own_outcome() {
+    let folder = kit::folder!("service-two");
+    let programs = "[[program]]\nname = 'main'\nimage = 'app.hex'\nnodes = [5]\ndialect = 'raw'\n\
+                    [[program]]\nname = 'data'\nimage = 'app.hex'\nnodes = [5]\nprogram = 2\ndialect = 'lift'\n\
+                    trial-run = false\n";
+    let (bus, _server) = kit::fake::serve(Bus(vec![device(5, 1234).0]));
+    let ui = station(&folder, package(&folder, programs), Some(bus));
+    let plan = planned(&ui);
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+    let state = ended(&ui);
+    let row = &state["rows"][0];
+    assert_eq!((&state["says"], &row["left"]), (&json!("bad"), &json!("left-other")), "{state}");
+    let states = [0, 1].map(|step: usize| row["steps"][step]["state"].as_str().unwrap());
+    assert_eq!(states, ["state-updated", "state-failed"]);
+    let table = &saved(&folder, "csv")[0].1;
+    let lines: Vec<&str> = table.lines().skip(1).collect();
+    assert!(lines[0].contains(",updated,,,J") && lines[1].contains(",failed,0x6"), "{table}");
+    let sheet = ui.get("sheet").body;
+    for (what, result) in [("ein zweites Mal", "1 von 2 gut"), ("Probelauf", "–")] {
+        let line = sheet.lines().find(|line| line.contains(what)).unwrap();
+        assert!(line.contains(&format!("<td>{result}</td></tr>")), "{line}");
+    }
+    assert!(sheet.contains("Knoten 5 · data</h3>"), "{sheet}");
+}
+
 /// The device has V1.10r101, and the file is V1.10r100 (expected.py): it is written if the user chooses it, and not
 /// before. Of another machine that is said once, without a word at its devices.
 #[test]

@@ -82,7 +82,7 @@ impl Procedure for Block {
         }
         update.known.state = DeviceState::Unreleased;
         if !options.start {
-            update.report(Phase::NotReleased.into());
+            update.report(Phase::NotReleased { program: number }.into());
             return Ok(Downloaded { repeats, took, released: Some(false), renewal: None });
         }
         if options.trial_run {

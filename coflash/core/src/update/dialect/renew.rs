@@ -59,7 +59,7 @@ impl Procedure for Renew {
         file: &Payload,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        (update.known.state, update.known.touched) = (DeviceState::Called, true);
+        update.known.touched = true;
         let result = renew(session, file, update);
         // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in
         // a device that is silent; the next power-on starts it there.
@@ -74,7 +74,8 @@ impl Procedure for Renew {
             update.report(Phase::Started(running).into());
         }
         // The new bootloader has answered, which is a verdict.
-        (update.known.state, update.losses) = (DeviceState::Untouched, None);
+        let state = if renewal.unchanged { DeviceState::Untouched } else { DeviceState::Renewed };
+        (update.known.state, update.losses) = (state, None);
         let Renewal { repeats, transfer: took, .. } = renewal;
         Ok(Downloaded { repeats, took, released: None, renewal: Some(Renewal { running, ..renewal }) })
     }

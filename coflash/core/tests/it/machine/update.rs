@@ -201,6 +201,8 @@ fn a_crc_alone_decides_nothing() {
         if todo == "older" {
             assert_eq!(outcomes, [(Some(5), 0, "6000040Fh".to_owned())], "{row}");
             plan.allow_older(|node| node.get() == 5);
+            let said = plan.to_string();
+            assert!(said.contains(", which is older") && !said.contains("not written"), "{said}");
             let outcomes = words(&carried_out(&mut bus, &package, &plan));
             assert!(is_written(&bus) && outcomes[0].2 == "updated", "{row}: {outcomes:?}");
         }

@@ -298,8 +298,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     assert_eq!((tried.state, tried.answer), (DeviceState::Unreleased, DeviceAnswer::Silent));
     assert_eq!(
         tried.to_string(),
-        "it does not answer; last known: it contains the new program, not released for autostart: after a reset the \
-         bootloader waits for the next attempt"
+        "it does not answer; last known: it contains the new program, not released for autostart"
     );
     let released = left(BOOTLOADER, &silent, FlashOptions::default().trial_run(false));
     assert_eq!((released.state, released.answer), (DeviceState::Released, DeviceAnswer::Silent));

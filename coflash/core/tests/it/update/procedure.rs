@@ -365,7 +365,7 @@ fn in_the_bootloader_no_call_and_without_start_none() {
     // Neither tried nor released for autostart.
     assert_eq!((fake.writes()[0], *fake.writes().last().unwrap()), ("command 03", "block -1"));
     assert_eq!((report.running, report.released, fake.running), (None, Some(false), Some(BOOTLOADER)));
-    assert!(events.contains(&Phase::NotReleased.into()), "{events:?}");
+    assert!(events.contains(&Phase::NotReleased { program: 1 }.into()), "{events:?}");
 }
 
 #[test]

@@ -26,7 +26,18 @@ pub fn new() -> Payload {
 }
 
 fn run_with(fake: &mut Fake, options: &FlashOptions) -> (Result<Renewal, Error>, Vec<Event>) {
+    let was = fake.running;
     let (result, mut events) = update(fake, new(), options);
+    // One that was in its bootloader was not called, and a new bootloader is told at the end.
+    let Some(Event::Done(done)) = events.last() else { panic!("{events:?}") };
+    match &result {
+        Ok(report) if report.renewal.unwrap().unchanged => {
+            assert_eq!(done.left.state, DeviceState::Untouched);
+        }
+        Ok(_) => assert_eq!(done.left.state, DeviceState::Renewed),
+        Err(_) if was == Some(BOOTLOADER) => assert_eq!(done.left.state, DeviceState::Untouched),
+        Err(_) => {}
+    }
     events.retain(|event| !matches!(event, Event::Progress { .. } | Event::Done(_)));
     (result.map(|report| report.renewal.unwrap()), events)
 }
