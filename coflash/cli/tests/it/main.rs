@@ -485,7 +485,7 @@ fn the_target_is_checked_before_anything_is_erased() {
     for option in [&["--check-target"][..], &["--chk_tgt", "1"]] {
         let words = [&["flash", "--node", "5", &file][..], &other, option].concat();
         let (done, fake) = served(Fake::new(APPLICATION), &words);
-        assert_eq!(done.exit, 6, "{}", done.err);
+        assert_eq!(done.exit, 3, "{}", done.err);
         assert_eq!(
             done.err,
             "error: the program is for vendor-ID 00000040h, and node 5 has 0000003Fh [0x60000180]\n  \
