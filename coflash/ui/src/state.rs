@@ -545,8 +545,7 @@ mod tests {
     impl Maker for Version {
         fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
             let value = match at {
-                (0x1018, 1) => 63,
-                (0x1018, 2) => 1234,
+                (0x1018, 1 | 2) => 0,
                 (0x2005, 1) => self.0,
                 _ => return None,
             };

@@ -245,6 +245,7 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
     for outcome in outcomes {
         // What is missing has no step, and is known from the plan.
         let Some(row) = rows.iter_mut().find(|row| row.is_of(outcome)) else { continue };
+        let is_new = row.steps.iter().any(|step| step.state == RowState::Updated);
         let Some(step) = row.steps.iter_mut().find(|step| step.entry == outcome.entry) else { continue };
         step.state = match &outcome.result {
             Ok(Good::Had) => RowState::Has,
@@ -256,6 +257,8 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
             Err(Bad::Left(DeviceFault::Older { .. })) => RowState::LeftOut,
             Err(bad) => {
                 let (message, left) = trouble::of_outcome(bad);
+                // "Its old program" would be that of the whole device.
+                let left = left.map(|left| if is_new && left == "left-old" { "left-other" } else { left });
                 // The first reason counts: the programs after it were not begun.
                 if row.trouble.is_none() {
                     (row.trouble, row.left) = (Some(message.clone()), left);
