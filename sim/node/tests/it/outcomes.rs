@@ -174,7 +174,7 @@ fn word(said: &str) -> &'static str {
         ("contains the new program, not released", "unreleased"),
         ("the new program, which is not confirmed", "unreleased"),
         ("The device has the new program", "unreleased"),
-        ("not released for autostart: the device stays", "unreleased"),
+        ("not released for autostart;", "unreleased"),
         ("it may have the old one", "unknown"),
         ("may have changed it", "unknown"),
         ("Its program is unknown", "unknown"),
