@@ -20,8 +20,8 @@ const PLLSRC_HSE: u32 = 1 << 22;
 const SWS_PLL: u32 = 0b10 << 2;
 const SWS: u32 = 0b11 << 2;
 /// Number of checks of a crystal, of the PLL or of the regulator before it is given up: at 16 MHz and
-/// 8 cycles a check this is 50 ms, ten times the start-up time of a crystal.
-const PATIENCE: u32 = 100_000;
+/// 5 to 8 cycles a check this is 47 to 75 ms, ten times the start-up time of a crystal.
+const PATIENCE: u32 = 150_000;
 
 impl Source {
     /// The clock tree with this source.

@@ -123,7 +123,7 @@ fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
         // Without its crystal the device takes part after a request of LSS alone: switch state global,
         // waiting (CiA 305).
         bench.post(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
-        bench.run_ms(20);
+        bench.run_ms(30);
         // NMT: reset node.
         bench.post(0x000, &[0x81, 0]);
         bench.run_ms(10);

@@ -347,18 +347,18 @@ mod tests {
     fn the_first_period_is_4096_counts_whatever_rlr_holds() {
         let mut dog = started();
         write(&mut dog, Time(0), &[(KR, 0x5555), (RLR, 1)]);
-        assert_eq!(dog.next_event(), Some(Time(512 * MS)));
+        assert_eq!(dog.expires(), Some(Time(512 * MS)));
         // Too early: the counter takes the old value.
         write(&mut dog, Time(MS / 10), &[(KR, 0xAAAA)]);
-        assert_eq!(dog.next_event(), Some(Time(512 * MS + MS / 10)));
+        assert_eq!(dog.expires(), Some(Time(512 * MS + MS / 10)));
         write(&mut dog, Time(MS), &[(KR, 0xAAAA)]);
-        assert_eq!(dog.next_event(), Some(Time(MS + 8 * PERIOD)));
+        assert_eq!(dog.expires(), Some(Time(MS + 8 * PERIOD)));
         // AAAAh before CCCCh loads nothing.
         let mut dog = super::tests::dog();
         dog.follow_lsi(true, Time(0));
         write(&mut dog, Time(0), &[(KR, 0x5555), (RLR, 1)]);
         write(&mut dog, Time(MS), &[(KR, 0xAAAA), (KR, 0xCCCC)]);
-        assert_eq!(dog.next_event(), Some(Time(513 * MS)));
+        assert_eq!(dog.expires(), Some(Time(513 * MS)));
     }
 
     /// Section 21.4.4: PVU and RVU are set for up to five periods of the LSI, and a value may be changed
@@ -394,13 +394,13 @@ mod tests {
         let half = Time(256 * MS - 5 * PERIOD);
         write(&mut dog, half, &[(KR, 0x5555), (PR, 6)]);
         // 2048 counts of 8 ms.
-        assert_eq!(dog.next_event(), Some(Time(256 * MS + 2048 * 8 * MS)));
+        assert_eq!(dog.expires(), Some(Time(256 * MS + 2048 * 8 * MS)));
         dog.advance(Time(300 * MS));
-        assert_eq!(dog.next_event(), Some(Time(256 * MS + 2048 * 8 * MS)));
+        assert_eq!(dog.expires(), Some(Time(256 * MS + 2048 * 8 * MS)));
         // It has run out before the new prescaler gets across.
         let mut dog = started();
         write(&mut dog, Time(512 * MS - PERIOD), &[(KR, 0x5555), (PR, 6)]);
-        assert_eq!(dog.next_event(), Some(Time(512 * MS)));
+        assert_eq!(dog.expires(), Some(Time(512 * MS)));
         dog.advance(Time(600 * MS));
         assert!(dog.has_expired());
     }
