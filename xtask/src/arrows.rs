@@ -53,7 +53,7 @@ const RULES: &[(&str, &str)] = &[
     ("coflash-native", "canopen coboot-can coflash-core shared-abi"),
     ("coboot-node", "boot-core canopen coboot-app coboot-can coflash-agent coflash-conform coflash-core shared-abi kit"),
     // Its command line reads memory maps.
-    ("emulator", "coboot-linker shared-abi kit"),
+    ("emulator", "coboot-linker shared-abi"),
     (KIT, "boot-core canopen coboot-app coboot-can seal shared-abi"),
     (
         "coboot-tests",

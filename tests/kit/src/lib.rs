@@ -8,7 +8,6 @@
 //! | `crc` | CRC-32 and CRC-16 from their definitions |
 //! | `ihex` | Intel HEX as tools write it |
 //! | `pages` | the commands on the pages of the documentation |
-//! | `assembler` | feature `assembler`: Thumb programs from assembler text |
 //! | `fake` | feature `fake`: devices with virtual time, as adapters and behind a socketcand server |
 //! | `hawkbit` | feature `hawkbit`: a hawkBit server with faults |
 //! | `http` | feature `http`: a page of `coflash ui` without a browser |
@@ -24,8 +23,6 @@
 #![allow(clippy::new_without_default, reason = "a device that has booted is no default value")]
 #![deny(unsafe_code)]
 
-#[cfg(feature = "assembler")]
-pub mod assembler;
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod bench;

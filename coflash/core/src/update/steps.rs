@@ -204,7 +204,7 @@ pub(super) fn clear_and_wait(
 pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
     let before = crc(session, number)?;
     execute(session, number, ProgramControl::Clear)?;
-    // Without a program before, nothing tells whether the rest of a cut-off download is gone.
+    // Without a program before, nothing says whether the rest of a cut-off download is gone.
     let is_erased = before.is_some_and(|crc| crc != 0) && crc(session, number)? == Some(0);
     if !is_erased {
         execute(session, number, ProgramControl::Clear)?;

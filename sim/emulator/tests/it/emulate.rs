@@ -5,7 +5,7 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use kit::assembler::assemble;
+use crate::assembler::assemble;
 
 fn emulate(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_emulate")).args(args).output().expect("the command starts")

@@ -8,9 +8,9 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use std::{env, fs, thread};
 
+use crate::assembler::{assemble, Assembled};
 use emulator::machine::{Machine, Options};
 use emulator::time::Time;
-use kit::assembler::{assemble, Assembled};
 use shared_abi::geometry::STM32F407VG;
 
 const STACK: u32 = 0x2001_0000;

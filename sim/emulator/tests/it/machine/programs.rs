@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use kit::assembler::assemble;
+use crate::assembler::assemble;
 
 /// A program: its code, where that lies, and the exception handlers by exception number.
 pub struct Program {
