@@ -26,7 +26,7 @@ pub fn intel_hex(base: u32, bytes: &[u8]) -> String {
     let mut text = String::new();
     for (n, data) in (0..).zip(bytes.chunks(16)) {
         let address = base.wrapping_add(16 * n);
-        if address == base || address % 0x1_0000 == 0 {
+        if address == base || address.is_multiple_of(0x1_0000) {
             text += &record(0, 4, &((address >> 16) as u16).to_be_bytes());
             text.push('\n');
         }

@@ -26,10 +26,10 @@ impl Assembled {
     }
 }
 
-/// Assembles a file below `tests/it`. Its code is for the address that it gives the symbol `BASE`,
+/// Assembles a file of this repository. Its code is for the address that it gives the symbol `BASE`,
 /// or for `base`.
 pub fn assemble(file: &str, base: u32) -> Assembled {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it").join(file);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(file);
     // The variable is that of `cargo xtask build`.
     let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
     clang.args(["--target=thumbv7em-none-eabihf", "-c", "-o", "-"]);
