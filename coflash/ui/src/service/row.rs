@@ -257,11 +257,12 @@ pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
             Err(Bad::Left(DeviceFault::Older { .. })) => RowState::LeftOut,
             Err(bad) => {
                 let (message, left) = trouble::of_outcome(bad);
-                // "Its old program" would be that of the whole device.
-                let left = left.map(|left| if is_new && left == "left-old" { "left-other" } else { left });
                 // The first reason counts: the programs after it were not begun.
                 if row.trouble.is_none() {
-                    (row.trouble, row.left) = (Some(message.clone()), left);
+                    // "Its old program" would be that of the whole device.
+                    let of_all =
+                        left.map(|left| if is_new && left == "left-old" { "left-other" } else { left });
+                    (row.trouble, row.left) = (Some(message.clone()), of_all);
                 }
                 (step.trouble, step.left) = (Some(message), left);
                 RowState::Failed
