@@ -463,7 +463,7 @@ impl Firmware {
                 Some(_) => verdict(Fits::Yes, "a bootloader for this product".to_string()),
                 None => verdict(Fits::Unknown, "the device does not report its bootloader".to_string()),
             },
-            _ if has == Installed::This => verdict(Fits::Yes, "in the device already (same CRC)".to_string()),
+            _ if has == Installed::This => verdict(Fits::Yes, "in the device already".to_string()),
             _ if has == Installed::Unknown => verdict(Fits::Unknown, EVERY_VERSION_HAS_THIS_CRC.to_string()),
             (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
             (None, _) => verdict(Fits::Unknown, "the file does not name its target device".to_string()),

@@ -86,6 +86,8 @@ fn a_step_that_fails_has_the_words_and_numbers_of_the_manual() {
 fn a_start_that_fails_is_told_with_the_device_s_reason() {
     for (state, words, advice) in [
         ([6, 1, 0], "(1F57h reads 02h); it has no program [", "flash a program"),
+        // Its other program was called back.
+        ([0, 1, 0], "(1F57h reads 02h)", "flash a program, and release it"),
         (
             [5, 4, 1],
             "(1F57h reads 02h); its program is not released for autostart; the program was ended by the independent \

@@ -1,7 +1,7 @@
 //! The advice for an error.
 
 use canopen::debugger::DEBUGGER;
-use canopen::program::{FlashError, ProgramControl, ACCESS, EVENTS};
+use canopen::program::{FlashError, FlashStatus, ProgramControl, ACCESS, EVENTS};
 use canopen::{AbortCode, NodeId};
 use coboot_can::AdapterError;
 use shared_abi::boot_report::Reason;
@@ -47,8 +47,12 @@ impl Error {
             Self::WrongCrc { .. } => Advice::WrongCrc,
             Self::TrialFailed { node, how } => trial_advice(node, how),
             Self::ProgramEnded { ended, .. } => ended_advice(ended.by),
-            Self::StartFailed { running: Some(running), state, .. } if running.is_bootloader() => {
-                not_started_advice(state)
+            Self::StartFailed { running: Some(running), status, state, .. } if running.is_bootloader() => {
+                match not_started_advice(state) {
+                    // It was not written a moment ago: it may not be there.
+                    Advice::NotStarted if finds_none(status) => Advice::NoValidProgram,
+                    advice => advice,
+                }
             }
             Self::StartFailed { elsewhere: Some(other), .. }
             | Self::FellSilent { elsewhere: Some(other), .. } => Advice::ProgramElsewhere { other },
@@ -108,6 +112,11 @@ fn not_started_advice(state: Option<BootloaderState>) -> Advice {
         (Some(Reason::Unsigned | Reason::CrashLoop), Some(by)) => ended_advice(Some(by)),
         _ => Advice::NotStarted,
     }
+}
+
+/// Whether the bootloader has refused to start a program because it has none that is valid.
+fn finds_none(status: Option<FlashStatus>) -> bool {
+    status.is_some_and(|status| status.error == Some(FlashError::NoValidProgram))
 }
 
 /// The advice for a program that ran for a while.
