@@ -48,10 +48,10 @@ impl Source {
             }
             bit = PLLSRC_HSE;
         }
-        let pll = (tree.hse / tree.pll_input) | (tree.pll_n << 6) | ((tree.pll_p / 2 - 1) << 16) | bit;
-        // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
-        // keep their reset values.
-        rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
+        let (m, p, q) = (tree.hse / tree.pll_input, tree.pll_p / 2 - 1, tree.pll_q());
+        let pll = q << 24 | bit | p << 16 | tree.pll_n << 6 | m;
+        // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and R keep their reset values.
+        rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xF000_0000 | pll) });
         // An application that jumped may have spread the clock, which CAN needs exact (section 7.3.23).
         rcc.sscgr().reset();
         raise_voltage(rcc);

@@ -25,6 +25,9 @@ pub struct ClockTree {
     pub wait_states: u32,
 }
 
+/// The PLL runs at no more than this, in Hz (RM0090 section 7.3.2).
+const FASTEST_VCO: u32 = 432_000_000;
+
 /// The core's clock after a reset, in Hz.
 pub const HSI: u32 = 16_000_000;
 
@@ -44,10 +47,20 @@ impl ClockTree {
         internal
     }
 
-    /// Whether the clocks are within these limits when their source is 5 % too fast.
+    /// The PLL's own frequency in Hz.
+    const fn vco(&self) -> u32 {
+        self.pll_input * self.pll_n
+    }
+
+    /// Whether the clocks are within these limits, and the flash has enough wait states for them, when their source is
+    /// 5 % too fast.
     const fn is_within(&self, limits: &Limits) -> bool {
         let fastest = self.sysclk() / 20 * 21;
-        fastest <= limits.sysclk && fastest / self.apb1 <= limits.apb1 && fastest / self.apb2 <= limits.apb2
+        fastest <= limits.sysclk
+            && fastest / self.apb1 <= limits.apb1
+            && fastest / self.apb2 <= limits.apb2
+            && (fastest - 1) / limits.per_wait_state <= self.wait_states
+            && self.vco() / 20 * 21 <= FASTEST_VCO
     }
 
     /// Whether the CAN controller can be set to each of these bit rates to which it can be set with the other tree.
@@ -66,7 +79,14 @@ impl ClockTree {
     /// The core's clock in Hz.
     #[must_use]
     pub const fn sysclk(&self) -> u32 {
-        self.pll_input * self.pll_n / self.pll_p
+        self.vco() / self.pll_p
+    }
+
+    /// The PLL's second output divider, 3 to 9: the clock for USB, SDIO and RNG is at most 48 MHz, also while
+    /// nothing uses it (DS8626, main PLL characteristics: 75 MHz at most, which HSI does not exceed either).
+    #[must_use]
+    pub const fn pll_q(&self) -> u32 {
+        self.vco().div_ceil(48_000_000)
     }
 
     /// The clock of APB1 in Hz.
@@ -118,8 +138,7 @@ impl ClockTree {
         if self.pll_n < 50 || self.pll_n > 432 {
             return Err("board: the PLL's multiplier must be 50 to 432");
         }
-        let vco = self.pll_input * self.pll_n;
-        if vco < 100_000_000 || vco > 432_000_000 {
+        if self.vco() < 100_000_000 || self.vco() > FASTEST_VCO {
             return Err("board: the PLL must run at 100 to 432 MHz");
         }
         if !is_divider(self.apb1) || !is_divider(self.apb2) {
@@ -262,6 +281,41 @@ mod tests {
             assert_eq!(internal.apb1_clock(), apb1 * 1_000_000);
             assert_eq!(internal.check(&line.limits()), Ok(()));
         }
+    }
+
+    /// Every multiplier and divider that `check` accepts, with as few wait states as it accepts.
+    #[test]
+    fn with_hsi_5_percent_too_fast_each_tree_keeps_the_limits_of_its_chip() {
+        let (mut trees, mut fewer) = (0, 0);
+        for (line, supply_mv) in
+            [(Line::F407, 3_300), (Line::F407, 1_800), (Line::F412, 2_400), (Line::F413, 3_300)]
+        {
+            let limits = line.limits_at(supply_mv);
+            for (pll_n, pll_p) in (50..=432).flat_map(|n| [2, 4, 6, 8].map(|p| (n, p))) {
+                let tree = ClockTree { pll_input: 1_000_000, pll_n, pll_p, ..FAST };
+                let wait_states = tree.sysclk().saturating_sub(1) / limits.per_wait_state;
+                let tree = ClockTree { wait_states, ..tree };
+                if tree.check(&limits).is_err() {
+                    continue;
+                }
+                let internal = tree.internal(&limits, &[125_000]);
+                let fastest = u64::from(internal.sysclk()) * 105 / 100;
+                let within = |hz: u64, most: u32| hz <= u64::from(most);
+                assert!(within(fastest, limits.per_wait_state * (wait_states + 1)), "{tree:?}: {internal:?}");
+                assert!(within(fastest, limits.sysclk) && within(fastest / 4, limits.apb1), "{tree:?}");
+                assert!(within(fastest / 2, limits.apb2), "{tree:?}: {internal:?}");
+                let vco = internal.pll_input * internal.pll_n;
+                assert!(within(u64::from(vco) * 105 / 100, 432_000_000), "{tree:?}: {internal:?}");
+                for vco in [vco, pll_n * 1_000_000] {
+                    // DS8626, main PLL characteristics.
+                    assert!(within(u64::from(vco / tree.pll_q()) * 105 / 100, 75_000_000), "{tree:?}");
+                }
+                assert!((2..=15).contains(&tree.pll_q()) && (2..=15).contains(&internal.pll_q()), "{tree:?}");
+                trees += 1;
+                fewer += u32::from(internal.pll_n < pll_n);
+            }
+        }
+        assert!(trees > 2_000 && fewer > 500, "{trees}, {fewer}");
     }
 
     #[test]

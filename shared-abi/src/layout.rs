@@ -29,8 +29,8 @@ pub const DEFAULT: &Layout = &stm32f407g_disc1::LAYOUT;
 pub const KEY_BLOCK_SIZE: u32 = 256;
 
 /// The least number of bytes of RAM after the bootloader's variables that remain for its stack. The
-/// boot stage, which copies the RAM image, uses the same RAM.
-pub const LEAST_STACK: u32 = 4096;
+/// boot stage, which copies the RAM image, uses the same RAM. `cargo xtask size` computes what they need.
+pub const LEAST_STACK: u32 = 8192;
 
 /// The size of [`Layout::kept`] in bytes.
 const KEPT: u32 = 1024;

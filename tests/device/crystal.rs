@@ -27,6 +27,23 @@ fn announced(bench: &Bench) -> Option<u8> {
     bench.emergencies(Time(0)).first().map(|data| data[7])
 }
 
+/// The PLL's second output, which nothing uses, is within its limit too: 75 MHz (DS8626, main PLL characteristics),
+/// by PLLCFGR's M, N and Q (RM0090 section 7.3.2) and the source's highest frequency.
+#[test]
+fn each_output_of_the_pll_is_within_its_limit() {
+    for (hse_hz, fastest) in [(8_000_000, 8_000_000), (0, 16_800_000)] {
+        let mut bench = Bench::with(Options { hse_hz, ..Options::default() });
+        bench.world.add_host_port(BIT_RATE);
+        bench.power_on();
+        bench.run_ms(300);
+        let pll = bench.machine().register(0x4002_3804).expect("PLLCFGR");
+        let (m, n, q) = (pll & 0x3F, pll >> 6 & 0x1FF, pll >> 24 & 0xF);
+        assert_eq!(pll >> 22 & 1, u32::from(hse_hz != 0), "its source");
+        let output = fastest / m * n / q;
+        assert!(q >= 2 && (30_000_000..=75_000_000).contains(&output), "{hse_hz}: {output} Hz");
+    }
+}
+
 /// Another node acknowledges the host's frames.
 #[test]
 fn without_its_crystal_a_device_only_listens_until_lss_speaks() {

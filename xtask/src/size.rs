@@ -1,4 +1,6 @@
-//! `cargo xtask size`: compares the bootloader's flash with its budget.
+//! `cargo xtask size`: compares the bootloader's flash and stack with their budgets.
+
+use std::process::Command;
 
 use serde_json::json;
 use shared_abi::layout::{Layout, BOARDS};
@@ -6,13 +8,13 @@ use shared_abi::layout::{Layout, BOARDS};
 use crate::args::Args;
 use crate::build::{self, Variant};
 use crate::setup::{self, Part};
-use crate::{elf, evidence, outcome::Outcome, toolchain, workspace};
+use crate::{elf, evidence, outcome::Outcome, process, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD]
 
-Builds the plain and the sealed bootloader for every board, and prints the flash of each. Fails when one
-is over the budget. What is in it by function:
+Builds the plain and the sealed bootloader for every board, and prints the flash of each, and the stack that it
+can need (tests/python/stack_depth.py). Fails when one is over the budget. What is in it by function:
 arm-none-eabi-nm --demangle --size-sort target/firmware/BOARD/bootloader.elf
 
   --board BOARD   before that, every bootloader of this board
@@ -33,7 +35,7 @@ const SPLIT_MAP: &str = "bootloader bootloader-sealed";
 pub fn run(mut args: Args) -> Outcome {
     let chosen = workspace::chosen_board(&mut args)?;
     args.none_left()?;
-    setup::prepare(&[Part::Firmware])?;
+    setup::prepare(&[Part::Firmware, Part::Python])?;
     if let Some(board) = chosen {
         // It prints the sizes.
         let all = Variant::of(board).filter(|variant| variant.is_bootloader()).map(|variant| variant.name);
@@ -42,8 +44,12 @@ pub fn run(mut args: Args) -> Outcome {
 
     let names = |board: &Layout| if board.home.is_some() { SPLIT_MAP } else { COMPACT_MAP };
     let gated: Vec<_> = BOARDS.iter().map(|board| (*board, names(board))).collect();
+    let mut stacks = Command::new(setup::python());
+    stacks.arg(workspace::root().join("tests/python/stack_depth.py"));
     for (board, names) in &gated {
-        build::images(board, &names.split(' ').collect::<Vec<_>>())?;
+        let names: Vec<_> = names.split(' ').collect();
+        let folder = build::images(board, &names)?;
+        stacks.args(names.iter().map(|name| folder.join(name).with_extension("elf")));
     }
     println!("board                    image                      at         bytes     of");
     let mut problems = Vec::new();
@@ -65,6 +71,8 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let facts = json!({"bootloaders": count, "failed": problems.len(), "images": images});
     evidence::record("size", facts)?;
+    println!("board                    image                      stack of    bytes     of");
+    process::run(&mut stacks)?;
     toolchain::notice();
     problems.into_iter().next().map_or(Ok(()), Err)
 }

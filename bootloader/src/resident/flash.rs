@@ -63,64 +63,12 @@ impl ResidentFlash {
         self.controller.clear_flags();
     }
 
-    /// The CRC of words with the unit of an application. Its interrupts wait for each part: one that uses the unit,
-    /// or changes the register of its clock, finds and leaves both as they are.
-    fn crc32_by_parts(crc: u32, region: Region) -> u32 {
-        (region.base..region.end()).step_by(SHARED_STEP as usize).fold(crc, |crc, at| {
-            let part = Region::new(at, SHARED_STEP.min(region.end() - at));
-            let by_unit = cortex_m::interrupt::free(|_| {
-                // SAFETY: nothing interrupts this code, which reads the flash and takes a unit that has no clock.
-                let (rcc, flash) = unsafe { (pac::RCC::steal(), Self::steal(CrcUnit::Own)) };
-                rcc.ahb1enr().read().crcen().is_disabled().then(|| {
-                    Self::switch_crc_unit_on(&rcc);
-                    let crc = flash.crc32(crc, part);
-                    flash.release(&rcc);
-                    crc
-                })
-            });
-            // SAFETY: it only reads the flash.
-            by_unit.unwrap_or_else(|| unsafe { Self::steal(CrcUnit::Taken) }.crc32(crc, part))
-        })
-    }
-}
-
-impl Flash for ResidentFlash {
-    fn read(&self, address: u32, buffer: &mut [u8]) {
-        self.controller.read(address, buffer);
-    }
-
-    fn read_word(&self, address: u32) -> u32 {
-        self.controller.read_word(address)
-    }
-
-    fn sector_at(&self, address: u32) -> Option<Sector> {
-        LAYOUT.chip.sector_at(address)
-    }
-
-    fn is_blank(&self, region: Region) -> bool {
-        let (mut address, end) = (region.base, region.end());
-        if address.is_multiple_of(4) && FLASH.contains(address, region.size) {
-            // It compares words, in a short loop.
-            while end - address >= 4 {
-                // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
-                if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
-                    return false;
-                }
-                address += 4;
-            }
-        }
-        (address..end).all(|address| self.controller.read_byte(address) == u8::MAX)
-    }
-
     /// The CRC unit computes whole words, software the rest. The unit has the right polynomial, but
     /// it takes words with the most significant bit first and always starts from its initial value.
     /// One additional word first brings it to the state of the previous CRC.
-    fn crc32(&self, mut crc: u32, region: Region) -> u32 {
+    fn crc32_of(&self, mut crc: u32, region: Region) -> u32 {
         let (mut address, end) = (region.base, region.end());
         let is_fit = address.is_multiple_of(4) && FLASH.contains(address, region.size);
-        if SHARES_CRC_UNIT && is_fit && self.crc_unit == CrcUnit::Shared {
-            return Self::crc32_by_parts(crc, region);
-        }
         if is_fit && self.crc_unit == CrcUnit::Own {
             // SAFETY: `steal` has taken the unit.
             let unit = unsafe { pac::CRC::steal() };
@@ -163,6 +111,63 @@ impl Flash for ResidentFlash {
             }
         }
         (address..end).fold(crc, |crc, address| crc::resume(crc, &[self.controller.read_byte(address)]))
+    }
+
+    /// The CRC of words with the unit of an application. Its interrupts wait for each part: one that uses the unit,
+    /// or changes the register of its clock, finds and leaves both as they are.
+    fn crc32_by_parts(crc: u32, region: Region) -> u32 {
+        (region.base..region.end()).step_by(SHARED_STEP as usize).fold(crc, |crc, at| {
+            let part = Region::new(at, SHARED_STEP.min(region.end() - at));
+            let by_unit = cortex_m::interrupt::free(|_| {
+                // SAFETY: nothing interrupts this code, which reads the flash and takes a unit that has no clock.
+                let (rcc, flash) = unsafe { (pac::RCC::steal(), Self::steal(CrcUnit::Own)) };
+                rcc.ahb1enr().read().crcen().is_disabled().then(|| {
+                    Self::switch_crc_unit_on(&rcc);
+                    let crc = flash.crc32_of(crc, part);
+                    flash.release(&rcc);
+                    crc
+                })
+            });
+            // SAFETY: it only reads the flash.
+            by_unit.unwrap_or_else(|| unsafe { Self::steal(CrcUnit::Taken) }.crc32_of(crc, part))
+        })
+    }
+}
+
+impl Flash for ResidentFlash {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.controller.read(address, buffer);
+    }
+
+    fn read_word(&self, address: u32) -> u32 {
+        self.controller.read_word(address)
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        LAYOUT.chip.sector_at(address)
+    }
+
+    fn is_blank(&self, region: Region) -> bool {
+        let (mut address, end) = (region.base, region.end());
+        if address.is_multiple_of(4) && FLASH.contains(address, region.size) {
+            // It compares words, in a short loop.
+            while end - address >= 4 {
+                // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
+                if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
+                    return false;
+                }
+                address += 4;
+            }
+        }
+        (address..end).all(|address| self.controller.read_byte(address) == u8::MAX)
+    }
+
+    fn crc32(&self, crc: u32, region: Region) -> u32 {
+        let is_fit = region.base.is_multiple_of(4) && FLASH.contains(region.base, region.size);
+        if SHARES_CRC_UNIT && is_fit && self.crc_unit == CrcUnit::Shared {
+            return Self::crc32_by_parts(crc, region);
+        }
+        self.crc32_of(crc, region)
     }
 
     /// The resident part erases nothing: boot stage and application must not wait for it. What needs an erase

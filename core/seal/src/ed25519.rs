@@ -133,7 +133,7 @@ pub struct Verification {
 }
 
 impl Verification {
-    /// Space for a verification; [`new`](Self::new) starts one. This value is a verification that
+    /// Space for a verification; [`start`](Self::start) starts one. This value is a verification that
     /// has ended with a bad signature. All zeros, so that it takes no flash.
     pub const IDLE: Self = Self {
         registers: [[0; 8]; 16],
@@ -148,38 +148,27 @@ impl Verification {
     };
 
     /// Starts with a signature (R and S), the public key to check it with (A), and SHA-512 of R, A
-    /// and the message.
-    #[must_use]
-    pub fn new(public: &[u8; 32], signature: &[u8; 64], digest: &[u8; 64]) -> Self {
-        let mut new = Self {
-            phase: Phase::Fraction,
-            power: 0,
-            zeros: 0,
-            bits: 253,
-            registers: [[0; 8]; 16],
-            points: [BASE; 2],
-            factors: [[0; 8]; 2],
-            public: [0; 8],
-            r: [0; 8],
-        };
-        words(public, &mut new.public);
-        words(signature, &mut new.r);
-        words(&signature[32..], &mut new.factors[0]);
-        if remainder(&new.factors[0], &L) != new.factors[0] {
-            new.phase = Phase::Done(false);
-        }
+    /// and the message. In place: the value has more than a kilobyte, which no stack has to hold.
+    pub fn start(&mut self, public: &[u8; 32], signature: &[u8; 64], digest: &[u8; 64]) {
+        *self = Self::IDLE;
+        self.bits = 253;
+        self.points = [BASE; 2];
+        words(public, &mut self.public);
+        words(signature, &mut self.r);
+        words(&signature[32..], &mut self.factors[0]);
+        let is_reduced = remainder(&self.factors[0], &L) == self.factors[0];
+        self.phase = if is_reduced { Phase::Fraction } else { Phase::Done(false) };
         let mut hash = [0; 16];
         words(digest, &mut hash);
-        new.factors[1] = remainder(&hash, &L);
-        new.registers[1] = new.public;
-        new.registers[1][7] &= !SIGN;
-        new.registers[0xc] = ONE;
+        self.factors[1] = remainder(&hash, &L);
+        self.registers[1] = self.public;
+        self.registers[1][7] &= !SIGN;
+        self.registers[0xc] = ONE;
         // 2^256 - 38 is twice the prime.
-        new.registers[0xd] = [!0; 8];
-        new.registers[0xd][0] = !38;
-        new.registers[0xe][0] = 121_666;
-        new.registers[0xf][0] = 121_665;
-        new
+        self.registers[0xd] = [!0; 8];
+        self.registers[0xd][0] = !38;
+        self.registers[0xe][0] = 121_666;
+        self.registers[0xf][0] = 121_665;
     }
 
     /// Continues for at most about a millisecond at 168 MHz; returns the result, or `None` if there

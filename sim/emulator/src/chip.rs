@@ -152,7 +152,7 @@ impl Chip {
             variant,
             silicon,
             supply: Supply::new(options.vdd_mv),
-            supervisor: Supervisor::default(),
+            supervisor: Supervisor::new(silicon),
             vdd: supply::NOMINAL,
             costs: options.costs,
             clock: CycleClock::new(Time(0), silicon.hsi_hz),
@@ -168,7 +168,7 @@ impl Chip {
             tims: tim::INSTANCES.each_ref().map(Tim::new),
             i2c: ["I2C1", "I2C2", "I2C3"].map(I2c::new),
             otg: Otg::default(),
-            pwr: Pwr::new(variant),
+            pwr: Pwr::new(variant, silicon),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
             exti: Exti::default(),
@@ -453,7 +453,7 @@ impl Chip {
     pub fn power_on(&mut self, now: Time) {
         self.clock = CycleClock::new(now, self.silicon.hsi_hz);
         self.lose_power();
-        self.supervisor = Supervisor::default();
+        self.supervisor = Supervisor::new(self.silicon);
         self.counters.resets = 0;
         self.slice.attention = false;
         self.reset(ResetCause::PowerOn);

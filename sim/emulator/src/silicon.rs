@@ -49,6 +49,9 @@ pub struct Silicon {
     /// flush them reads old data, and runs old code, which is reported (RM0090 section 3.6.4). Most programs never
     /// meet one.
     pub stale_lines: bool,
+    /// Where the thresholds of the supply (PVD, BOR, POR and PDR) are between the lowest (0) and the highest (1000)
+    /// of the datasheet, in thousandths; 500 is typical.
+    pub threshold_permille: u32,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -66,10 +69,11 @@ pub const TYPICAL: Silicon = Silicon {
     can_sticks: false,
     flash_slowness_permille: 0,
     stale_lines: false,
+    threshold_permille: 500,
 };
 
-/// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, and the first
-/// period of SysTick is the longest.
+/// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, the first period of
+/// SysTick is the longest, and a supply that falls is noticed late.
 pub const WORST: Silicon = Silicon {
     lsi_hz: *LSI.end(),
     hsi_hz: *HSI.end(),
@@ -84,6 +88,7 @@ pub const WORST: Silicon = Silicon {
     can_sticks: true,
     flash_slowness_permille: *FLASH_SLOWNESS.end(),
     stale_lines: true,
+    threshold_permille: *THRESHOLD.start(),
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
@@ -94,6 +99,7 @@ const CRYSTAL_START: RangeInclusive<u32> = 300..=20_000;
 const PLL_FREE: RangeInclusive<u32> = 4_000_000..=64_000_000;
 const CAN_MODE: RangeInclusive<u32> = 0..=30;
 const FLASH_SLOWNESS: RangeInclusive<u32> = 0..=1_000;
+const THRESHOLD: RangeInclusive<u32> = 0..=1_000;
 
 impl Silicon {
     /// A chip that the seed chooses.
@@ -121,6 +127,7 @@ impl Silicon {
             stale_lines: draw(0..=1) == 1,
             pll_free_hz: draw(PLL_FREE),
             iwdg_update_prescaled: draw(0..=1) == 1,
+            threshold_permille: draw(THRESHOLD),
         }
     }
 }
@@ -136,6 +143,7 @@ impl fmt::Display for Silicon {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
         let Self { crystal_start_us, pll_free_hz, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
+        let threshold = self.threshold_permille;
         let of = if self.iwdg_update_prescaled { "prescaled LSI" } else { "LSI" };
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
@@ -144,7 +152,8 @@ impl fmt::Display for Silicon {
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
              PLL without an input: {pll_free_hz} Hz, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
-             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}"
+             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}, \
+             thresholds of the supply: {threshold} ‰ from lowest to highest"
         )
     }
 }
@@ -213,6 +222,7 @@ mod tests {
             assert!((300..=20_000).contains(&chip.crystal_start_us), "{seed}: {chip}");
             assert!(chip.can_mode_us <= 30, "{seed}: {chip}");
             assert!(chip.flash_slowness_permille <= 1_000, "{seed}: {chip}");
+            assert!(chip.threshold_permille <= 1_000, "{seed}: {chip}");
             assert_eq!(Silicon::drawn(seed), *chip, "{seed}");
         }
         // The ends are reached, or nearly.

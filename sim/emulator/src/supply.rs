@@ -1,18 +1,23 @@
 //! The supply VDD as a voltage that changes in time, and the circuits that hold the chip in reset while it
 //! is too low (RM0090 sections 5.2.1 and 5.2.2).
 //!
-//! The thresholds are the typical ones of the datasheet (DocID022152, "Embedded reset and power control
-//! block characteristics"), falling and rising, in mV.
+//! The thresholds are those of the datasheet (DocID022152, "Embedded reset and power control block
+//! characteristics"); where a chip is in their ranges is drawn.
 
+use crate::silicon::Silicon;
 use crate::time::{Span, Time};
 
 /// VDD of most boards, in mV.
 pub const NOMINAL: u32 = 3_300;
 
 /// Power-down and power-on reset.
-const POWER: (u32, u32) = (1_680, 1_720);
+const POWER: Threshold = Threshold { falling: [1_600, 1_680, 1_760], rising: [1_640, 1_720, 1_800] };
 /// Brown-out reset by the option bits BOR_LEV: level 3, 2, 1.
-const BROWN_OUT: [(u32, u32); 3] = [(2_830, 2_920), (2_500, 2_590), (2_190, 2_290)];
+const BROWN_OUT: [Threshold; 3] = [
+    Threshold { falling: [2_750, 2_830, 2_880], rising: [2_850, 2_920, 2_970] },
+    Threshold { falling: [2_440, 2_500, 2_560], rising: [2_530, 2_590, 2_630] },
+    Threshold { falling: [2_130, 2_190, 2_240], rising: [2_230, 2_290, 2_330] },
+];
 
 /// Below this voltage the RAM forgets, in mV. No document of ST has a value; static RAM keeps its contents
 /// far below the voltage at which it works.
@@ -22,6 +27,24 @@ const RAM_KEPT: Span = Span::from_millis(10);
 const RAM_LOST: Span = Span::from_millis(1_000);
 /// The shortest step in which a voltage changes.
 const STEP: Span = Span::from_micros(1);
+
+/// A threshold of the supply with its hysteresis, in mV: lowest, typical and highest of all chips.
+#[derive(Clone, Copy)]
+pub(crate) struct Threshold {
+    pub(crate) falling: [u32; 3],
+    pub(crate) rising: [u32; 3],
+}
+
+impl Threshold {
+    /// The falling and the rising one of this chip.
+    pub(crate) fn of(self, silicon: Silicon) -> (u32, u32) {
+        let within = |[lowest, typical, highest]: [u32; 3]| match silicon.threshold_permille {
+            low @ 0..500 => lowest + (typical - lowest) * low / 500,
+            high => typical + (highest - typical) * (high - 500) / 500,
+        };
+        (within(self.falling), within(self.rising))
+    }
+}
 
 /// VDD: constant, or on its way to another value in a straight line.
 #[derive(Clone, Debug)]
@@ -78,8 +101,9 @@ pub enum Change {
 }
 
 /// The reset by the supply.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Supervisor {
+    silicon: Silicon,
     held: Option<InReset>,
 }
 
@@ -94,6 +118,12 @@ struct InReset {
 }
 
 impl Supervisor {
+    /// That of this chip, which it does not hold in reset.
+    #[must_use]
+    pub fn new(silicon: Silicon) -> Self {
+        Self { silicon, held: None }
+    }
+
     /// Whether the chip is held in reset.
     #[must_use]
     pub fn holds(&self) -> bool {
@@ -102,7 +132,9 @@ impl Supervisor {
 
     /// The supply has this voltage now; `level` is BOR_LEV, 3 for off.
     pub fn watch(&mut self, mv: u32, level: u8, now: Time) -> Option<Change> {
-        let (falling, rising) = BROWN_OUT.get(usize::from(level)).copied().unwrap_or(POWER);
+        let power_down = POWER.of(self.silicon);
+        let brown_out = BROWN_OUT.get(usize::from(level)).map(|threshold| threshold.of(self.silicon));
+        let (falling, rising) = brown_out.unwrap_or(power_down);
         let Some(held) = &mut self.held else {
             if mv >= falling {
                 return None;
@@ -111,7 +143,7 @@ impl Supervisor {
             self.watch(mv, level, now);
             return Some(Change::Falls);
         };
-        held.powered_down |= mv < POWER.0;
+        held.powered_down |= mv < power_down.0;
         match (held.dark_since, mv < RETENTION) {
             (None, true) => held.dark_since = Some(now),
             (Some(since), false) => {
@@ -138,6 +170,7 @@ fn ram_lost(dark: Span) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::silicon::TYPICAL;
 
     fn ms(n: u64) -> Time {
         Time(0) + Span::from_millis(n)
@@ -164,13 +197,20 @@ mod tests {
         assert_eq!(supply.at(ms(9_000_001)), 0);
     }
 
-    /// Datasheet, typical: the thresholds have a hysteresis of 40 and about 100 mV.
+    /// Datasheet: the thresholds have a hysteresis of 40 and about 100 mV. Typical, and at their ends.
     #[test]
     fn the_level_of_the_option_bytes_decides_where_the_reset_is() {
-        for (level, falling, rising) in
-            [(3, 1_680, 1_720), (2, 2_190, 2_290), (1, 2_500, 2_590), (0, 2_830, 2_920)]
-        {
-            let mut supervisor = Supervisor::default();
+        for (threshold_permille, level, falling, rising) in [
+            (500, 3, 1_680, 1_720),
+            (500, 2, 2_190, 2_290),
+            (500, 1, 2_500, 2_590),
+            (500, 0, 2_830, 2_920),
+            (0, 3, 1_600, 1_640),
+            (0, 0, 2_750, 2_850),
+            (1_000, 1, 2_560, 2_630),
+            (1_000, 0, 2_880, 2_970),
+        ] {
+            let mut supervisor = Supervisor::new(Silicon { threshold_permille, ..TYPICAL });
             assert_eq!(supervisor.watch(falling, level, ms(1)), None);
             assert_eq!(supervisor.watch(falling - 1, level, ms(2)), Some(Change::Falls), "level {level}");
             assert!(supervisor.holds());
@@ -185,13 +225,13 @@ mod tests {
     #[test]
     fn the_ram_forgets_with_the_time_without_a_supply() {
         for (off, lost) in [(1, 0), (10, 0), (505, 500), (1_000, 1_000), (3_600_000, 1_000)] {
-            let mut supervisor = Supervisor::default();
+            let mut supervisor = Supervisor::new(TYPICAL);
             supervisor.watch(0, 3, ms(5));
             let rises = Change::Rises { powered_down: true, ram_lost: lost };
             assert_eq!(supervisor.watch(3_300, 3, ms(5 + off)), Some(rises), "{off} ms");
         }
         // Above its retention voltage, it forgets nothing.
-        let mut supervisor = Supervisor::default();
+        let mut supervisor = Supervisor::new(TYPICAL);
         supervisor.watch(1_200, 3, ms(5));
         let rises = Change::Rises { powered_down: true, ram_lost: 0 };
         assert_eq!(supervisor.watch(3_300, 3, ms(9_000)), Some(rises));

@@ -62,5 +62,5 @@ pub(super) fn start(
     for part in message {
         hash.update(part);
     }
-    *verification = Verification::new(key, signature, &hash.finish());
+    verification.start(key, signature, &hash.finish());
 }

@@ -13,7 +13,8 @@ fn verify(public: &[u8; 32], message: &[u8], signature: &[u8; 64]) -> bool {
 
 fn verdict_and_steps(public: &[u8; 32], message: &[u8], signature: &[u8; 64]) -> (bool, usize) {
     let digest = Sha512::new().chain_update(&signature[..32]).chain_update(public).chain_update(message);
-    let mut verification = Verification::new(public, signature, &digest.finalize().into());
+    let mut verification = Verification::IDLE;
+    verification.start(public, signature, &digest.finalize().into());
     let steps = |step| verification.step().map(|verdict| (verdict, step));
     let (verdict, steps) = (0..1000).find_map(steps).expect("more than 1000 steps");
     assert_eq!(verification.step(), Some(verdict), "the verdict stays");

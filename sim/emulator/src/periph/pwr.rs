@@ -1,7 +1,8 @@
 //! Power controller (RM0090 section 5, RM0390 section 5).
 
 use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
-use crate::supply::NOMINAL;
+use crate::silicon::Silicon;
+use crate::supply::{Threshold, NOMINAL};
 use crate::time::Time;
 use crate::variant::Variant;
 
@@ -22,23 +23,24 @@ const CSR_PVDO: u32 = 1 << 2;
 const CSR_EWUP: u32 = 1 << 8;
 const CSR_VOSRDY: u32 = 1 << 14;
 
-/// The thresholds of the voltage detector by PLS, falling and rising, in mV: typical ones of the datasheet
-/// (DocID022152, "Embedded reset and power control block characteristics").
-const PVD: [(u32, u32); 8] = [
-    (2_040, 2_140),
-    (2_190, 2_300),
-    (2_350, 2_450),
-    (2_510, 2_600),
-    (2_660, 2_760),
-    (2_840, 2_930),
-    (2_930, 3_030),
-    (3_030, 3_140),
+/// The thresholds of the voltage detector by PLS (datasheet DocID022152, "Embedded reset and power control
+/// block characteristics").
+const PVD: [Threshold; 8] = [
+    Threshold { falling: [1_980, 2_040, 2_080], rising: [2_090, 2_140, 2_190] },
+    Threshold { falling: [2_130, 2_190, 2_250], rising: [2_230, 2_300, 2_370] },
+    Threshold { falling: [2_290, 2_350, 2_390], rising: [2_390, 2_450, 2_510] },
+    Threshold { falling: [2_440, 2_510, 2_560], rising: [2_540, 2_600, 2_650] },
+    Threshold { falling: [2_590, 2_660, 2_710], rising: [2_700, 2_760, 2_820] },
+    Threshold { falling: [2_650, 2_840, 2_920], rising: [2_860, 2_930, 2_990] },
+    Threshold { falling: [2_850, 2_930, 2_990], rising: [2_960, 3_030, 3_100] },
+    Threshold { falling: [2_950, 3_030, 3_090], rising: [3_070, 3_140, 3_210] },
 ];
 
 /// Regulator scale, voltage detector, backup-domain access and Standby; Stop is not modelled.
 #[derive(Clone, Debug)]
 pub struct Pwr {
     variant: &'static Variant,
+    silicon: Silicon,
     cr: u32,
     /// WUF, SBF and EWUP.
     csr: u32,
@@ -51,8 +53,8 @@ pub struct Pwr {
 impl Pwr {
     /// As after a reset, on this chip.
     #[must_use]
-    pub fn new(variant: &'static Variant) -> Self {
-        Self { variant, cr: variant.voltage_scale.1, csr: 0, supply: NOMINAL, is_low: false }
+    pub fn new(variant: &'static Variant, silicon: Silicon) -> Self {
+        Self { variant, silicon, cr: variant.voltage_scale.1, csr: 0, supply: NOMINAL, is_low: false }
     }
 
     /// VDD has this voltage in mV.
@@ -72,7 +74,7 @@ impl Pwr {
     }
 
     fn pvd(&self) -> (u32, u32) {
-        PVD[((self.cr & CR_PLS) >> 5) as usize]
+        PVD[((self.cr & CR_PLS) >> 5) as usize].of(self.silicon)
     }
 
     /// After a change of PVDE or PLS, the supply counts as one that rises: the manual has no time after which
@@ -88,7 +90,7 @@ impl Pwr {
 
     /// As after a reset, at the same supply.
     fn fresh(&self) -> Self {
-        Self { supply: self.supply, ..Self::new(self.variant) }
+        Self { supply: self.supply, ..Self::new(self.variant, self.silicon) }
     }
 
     /// CR.VOS: whether the regulator is at scale 1, which the fastest clocks need.
@@ -183,6 +185,7 @@ mod tests {
     use shared_abi::geometry::STM32F407VG;
 
     use super::*;
+    use crate::silicon::TYPICAL;
     use crate::variant;
 
     const CR: u32 = 0x00;
@@ -192,7 +195,7 @@ mod tests {
     #[test]
     fn the_voltage_detector_compares_the_supply_with_its_threshold() {
         for (pls, falling, rising) in [(0, 2_040, 2_140), (4, 2_660, 2_760), (7, 3_030, 3_140)] {
-            let mut pwr = Pwr::new(variant::of(&STM32F407VG));
+            let mut pwr = Pwr::new(variant::of(&STM32F407VG), TYPICAL);
             let low = |pwr: &mut Pwr, mv| {
                 pwr.set_supply(mv);
                 pwr.read(CSR, Time(0)).unwrap() & 1 << 2 != 0
@@ -212,7 +215,7 @@ mod tests {
     /// EWUP, too. With WUF set the chip does not stay in Standby.
     #[test]
     fn standby_is_remembered_until_the_program_clears_it() {
-        let mut pwr = Pwr::new(variant::of(&STM32F407VG));
+        let mut pwr = Pwr::new(variant::of(&STM32F407VG), TYPICAL);
         assert!(!pwr.chooses_standby());
         pwr.write(CR, CR_PDDS, Time(0)).unwrap();
         assert!(pwr.chooses_standby() && !pwr.enter_standby());
