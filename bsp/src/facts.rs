@@ -147,8 +147,8 @@ pub const SUPPLY_MV: u32 = {
 };
 /// How many bytes of the flash are programmed at a time: 1, 2 or 4.
 pub const FLASH_WIDTH: u32 = voltage::flash_width(SUPPLY_MV);
-/// The highest clocks at this supply.
-const LIMITS: Limits = CHIP.line.limits_at(SUPPLY_MV);
+/// The highest clocks at the lowest supply with which the device works on.
+const LIMITS: Limits = CHIP.line.limits_at(voltage::lowest(SUPPLY_MV));
 /// How the clocks are made; the chip can run with them.
 pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&LIMITS);
 /// The same with HSI in place of the crystal.

@@ -28,10 +28,7 @@ const DETECTOR: [(u32, u32); 8] = [
 /// slowly is between the board's lowest and that for as long as it likes. Without a detector 1.
 #[must_use]
 pub const fn flash_width(supply_mv: u32) -> u32 {
-    let lowest = match detector_level(supply_mv) {
-        Some(level) => DETECTOR[level as usize].0,
-        None => *RANGE.start(),
-    };
+    let lowest = lowest(supply_mv);
     let [words, halves, bytes] = NEEDS;
     if lowest >= words.1 {
         words.0
@@ -39,6 +36,16 @@ pub const fn flash_width(supply_mv: u32) -> u32 {
         halves.0
     } else {
         bytes.0
+    }
+}
+
+/// The lowest supply, in mV, that the voltage detector of some chip lets pass on a board with at least this supply: what
+/// the flash has to work with. Without a detector it is the chip's.
+#[must_use]
+pub const fn lowest(supply_mv: u32) -> u32 {
+    match detector_level(supply_mv) {
+        Some(level) => DETECTOR[level as usize].0,
+        None => *RANGE.start(),
     }
 }
 

@@ -16,14 +16,14 @@ attack. The counts go to target/evidence/attacker.json.
 
   --frames N      the frames of the masters on the boards (default: 200000, about two minutes); the
                   nodes, which are faster, get twenty times as many
-  --silicon N     plays the main job, ways back, trials, hangs, stores and power cuts on N chips that
-                  seeds draw, in place of the attack; the counts go to target/evidence/silicon.json
+  --silicon N     plays stories of a device (main job, hangs, stores, power, crystal, supply, renewal, ...) on N
+                  chips that seeds draw, in place of the attack; the counts go to target/evidence/silicon.json
   --seed S        the first seed (default: 1)
 ";
 
 /// The images of the attack, on the board with two programs.
 const IMAGES: &str =
-    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can app-v1 \
+    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can bootloader-watchdog app-v1 \
     app-v2 app-test app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
 
 pub fn run(mut args: Args) -> Outcome {

@@ -4,13 +4,15 @@ use std::fs;
 use std::process::Command;
 
 use serde_json::json;
+use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{coverage, evidence, files, outcome::Outcome, process, workspace};
+use crate::{build, coverage, evidence, files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [OPTIONS]
+       cargo xtask mutants --silicon [NAME...]
 
 Changes the code of the device's crates in one place at a time with cargo-mutants, and runs the
 crate's tests: each change must make one fail. Fails if a change stays unnoticed that
@@ -20,6 +22,9 @@ crate's tests: each change must make one fail. Fails if a change stays unnoticed
   --in-diff BASE  the changes alone in lines that differ from this commit
   --shard K/N     the K-th of N parts, from 0
   OPTIONS         for cargo-mutants, as --file '**/store/*.rs' or --list
+
+  --silicon       in place of that: for each rule of the chip in tests/mutants-silicon builds the firmware of the last
+                  commit without it; one of the first 24 chips of `cargo xtask attack --silicon` has to fail
 
 It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed into target/tools.
 ";
@@ -35,7 +40,69 @@ const WITH_SEALED: &str = "--features=coboot-core/sealed --test-package=coboot-c
                            --cargo-arg=--test=it --cargo-arg=--test=sealed \
                            --cargo-test-arg=-- --cargo-test-arg=objects::";
 
+/// The images of the stories on drawn chips, and how many chips play them.
+const STORIES: &str = "bootloader bootloader-watchdog bootloader-sealed app-v1 app-v2 app-test";
+const CHIPS: &str = "24";
+
+/// Breaks one rule of the chip at a time, in a clone.
+fn silicon(names: &[String]) -> Outcome {
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
+    let clone = workspace::target_dir().join("mutants/silicon");
+    files::remove(&clone)?;
+    let mut git = Command::new("git");
+    process::run(git.args(["clone", "--quiet", "--local"]).arg(workspace::root()).arg(&clone))?;
+    let git = |words: &[&str]| process::run(Command::new("git").current_dir(&clone).args(words));
+    // Plays the stories; returns the seeds that fail.
+    let play = || -> Outcome<Vec<String>> {
+        let mut build = process::bare_cargo();
+        build.args(["xtask", "build"]).args(STORIES.split(' ')).current_dir(&clone);
+        process::output(build.env_remove("CARGO_TARGET_DIR").env_remove("CARGO_MANIFEST_DIR"))?;
+        let mut attack = build::tests_program(DEFAULT, "attack");
+        attack.env("COBOOT_FIRMWARE_DIR", clone.join("target/firmware").join(DEFAULT.board));
+        attack.args(["--silicon", CHIPS, "--seed", "0"]);
+        let done = attack.output().map_err(|error| process::not_started(&attack, &error))?;
+        let text = String::from_utf8_lossy(&done.stdout);
+        let seeds = text.lines().filter_map(|line| Some(line.split_once(" failed: ")?.0.to_owned()));
+        let seeds: Vec<_> = seeds.collect();
+        (done.status.success() == seeds.is_empty())
+            .then_some(seeds)
+            .ok_or_else(|| format!("the stories were not played: {}", String::from_utf8_lossy(&done.stderr)))
+    };
+    let failed = play()?;
+    if !failed.is_empty() {
+        return Err(format!("the firmware as it is fails with the chips {}.", failed.join(", ")));
+    }
+    let (mut tried, mut missed) = (0, Vec::new());
+    for patch in files::within(&clone.join("tests/mutants-silicon"))? {
+        let name = patch.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        if !names.is_empty() && !names.contains(&name) {
+            continue;
+        }
+        let patch = patch.to_string_lossy().into_owned();
+        git(&["apply", &patch])?;
+        let failed = play()?;
+        git(&["apply", "--reverse", &patch])?;
+        println!("{name:<36} {:>2} of {CHIPS} chips fail", failed.len());
+        tried += 1;
+        missed.extend(failed.is_empty().then_some(name));
+    }
+    if names.is_empty() {
+        evidence::record(
+            "mutants-silicon",
+            json!({"tried": tried, "failed": missed.len(), "missed": missed}),
+        )?;
+    }
+    match missed.len() {
+        0 if tried > 0 => Ok(()),
+        0 => Err(format!("no patch in tests/mutants-silicon has the name {}.", names.join(", "))),
+        count => Err(format!("no chip notices {count} mutants: {}.", missed.join(", "))),
+    }
+}
+
 pub fn run(mut args: Args) -> Outcome {
+    if args.flag("--silicon") {
+        return silicon(&args.remaining());
+    }
     let (package, base, shard) = (args.value("--package")?, args.value("--in-diff")?, args.value("--shard")?);
     if let Some(name) = package.as_deref().filter(|name| !coverage::PACKAGES.contains(name)) {
         return Err(format!("there is no crate \"{name}\"; there is: {}.", coverage::PACKAGES.join(", ")));
@@ -108,5 +175,26 @@ pub fn run(mut args: Args) -> Outcome {
     match missed.len() {
         0 => Ok(()),
         count => Err(format!("no test notices these {count} changes:\n{}", missed.join("\n"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_has_each_rule_of_the_chip() {
+        let page = files::ours("docs/emulator.md").unwrap();
+        let patches = files::within(&workspace::root().join("tests/mutants-silicon")).unwrap();
+        for patch in &patches {
+            let text = files::text(patch).unwrap();
+            let [rule, source, without] = [0, 1, 2].map(|n| text.lines().nth(n).unwrap_or_default());
+            let name = patch.file_stem().unwrap_or_default().to_string_lossy();
+            let source = source.strip_prefix("Source: ").expect("the second line");
+            let without = without.strip_prefix("Without: ").expect("the third line");
+            let row = format!("| {name} | {rule} | {source} | {without} |\n");
+            assert!(page.contains(&row), "docs/emulator.md does not have this row:\n{row}");
+        }
+        assert!(patches.len() >= 25);
     }
 }

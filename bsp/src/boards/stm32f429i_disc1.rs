@@ -31,7 +31,7 @@ pub const FACTS: Facts = Facts {
         pll_p: 2,
         apb1: 4,
         apb2: 2,
-        wait_states: 5,
+        wait_states: 6,
     },
     // The blue button B1 (UM1670).
     entry_strap: Some(Strap { port: 'A', pin: 0, pressed: true, pull: Pull::None }),

@@ -514,6 +514,11 @@ impl BxCan {
             0x0 => {
                 mailbox.tir = value & !ir::TXRQ;
                 if value & ir::TXRQ != 0 {
+                    if self.silicon.can_forgets_requests && self.mode != Mode::Normal {
+                        return unmodelled(
+                            "TXRQ before INAK and SLAK are cleared: the controller may never send the frame",
+                        );
+                    }
                     mailbox.flags = 0;
                     mailbox.state = MailboxState::Pending { since: now, order };
                     self.requests += 1;

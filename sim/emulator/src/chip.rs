@@ -66,6 +66,16 @@ pub struct Counters {
     pub longest_between_feeds: Span,
 }
 
+/// Peripherals whose clocks software has just switched on ([`Silicon::late_clocks`]).
+#[derive(Clone, Copy, Debug)]
+struct LateClocks {
+    /// The offset in RCC of the register, and the bits in it.
+    register: u32,
+    bits: u32,
+    /// The run of code: its address and length, and the cycles at its start.
+    run: (u32, u32, u64),
+}
+
 /// The chip around the CPU.
 pub struct Chip {
     /// What the chip has.
@@ -87,6 +97,8 @@ pub struct Chip {
     pub flash: Flash,
     /// Clocks and reset flags.
     pub rcc: Rcc,
+    /// The clocks of peripherals that were switched on last.
+    late: Option<LateClocks>,
     /// The watchdog.
     pub iwdg: Iwdg,
     wwdg: Wwdg,
@@ -153,6 +165,7 @@ impl Chip {
             silicon,
             supply: Supply::new(options.vdd_mv),
             supervisor: Supervisor::new(silicon),
+            late: None,
             vdd: supply::NOMINAL,
             costs: options.costs,
             clock: CycleClock::new(Time(0), silicon.hsi_hz),

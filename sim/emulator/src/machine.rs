@@ -614,8 +614,9 @@ impl Machine {
         }
         let chip = self.cpu.chip_mut();
         chip.store(address, 4, u32::from_le_bytes([a, b, c, d]));
-        // No instruction made these accesses.
+        // No instruction made these accesses, and a debug port takes its time.
         chip.slice.unlocated.clear();
+        chip.await_clocks();
         Ok(())
     }
 

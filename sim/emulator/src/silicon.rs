@@ -52,6 +52,13 @@ pub struct Silicon {
     /// Where the thresholds of the supply (PVD, BOR, POR and PDR) are between the lowest (0) and the highest (1000)
     /// of the datasheet, in thousandths; 500 is typical.
     pub threshold_permille: u32,
+    /// Whether a peripheral takes some cycles after the store that switches its clock on: an access in the same
+    /// straight run of code is lost, unless it has a DSB, or reads the register of the clock back (ES0182, delay after
+    /// an RCC peripheral clock enabling: 2 cycles of AHB, or 1 and the divider of APB).
+    pub late_clocks: bool,
+    /// Whether a request for transmission (TXRQ) is lost before the controller takes part in the bus. RM0090 section
+    /// 32.4.2 has the software wait for INAK to be cleared, and does not say what happens to one that does not.
+    pub can_forgets_requests: bool,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -70,6 +77,8 @@ pub const TYPICAL: Silicon = Silicon {
     flash_slowness_permille: 0,
     stale_lines: false,
     threshold_permille: 500,
+    late_clocks: false,
+    can_forgets_requests: false,
 };
 
 /// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, the first period of
@@ -89,6 +98,8 @@ pub const WORST: Silicon = Silicon {
     flash_slowness_permille: *FLASH_SLOWNESS.end(),
     stale_lines: true,
     threshold_permille: *THRESHOLD.start(),
+    late_clocks: true,
+    can_forgets_requests: true,
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
@@ -128,6 +139,8 @@ impl Silicon {
             pll_free_hz: draw(PLL_FREE),
             iwdg_update_prescaled: draw(0..=1) == 1,
             threshold_permille: draw(THRESHOLD),
+            late_clocks: draw(0..=1) == 1,
+            can_forgets_requests: draw(0..=1) == 1,
         }
     }
 }
@@ -143,7 +156,7 @@ impl fmt::Display for Silicon {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
         let Self { crystal_start_us, pll_free_hz, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
-        let threshold = self.threshold_permille;
+        let Self { threshold_permille: threshold, late_clocks, can_forgets_requests, .. } = self;
         let of = if self.iwdg_update_prescaled { "prescaled LSI" } else { "LSI" };
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
@@ -153,7 +166,9 @@ impl fmt::Display for Silicon {
              PLL without an input: {pll_free_hz} Hz, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
              on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}, \
-             thresholds of the supply: {threshold} ‰ from lowest to highest"
+             thresholds of the supply: {threshold} ‰ from lowest to highest, \
+             clocks of peripherals are late: {late_clocks}, CAN forgets early requests: \
+             {can_forgets_requests}"
         )
     }
 }

@@ -109,6 +109,18 @@ fn what_a_deep_sleeper_is_told_is_lost() {
     assert_eq!((bench.read(TSR) & 1 << 7, bench.read(ESR) & 7 << 4), (0, 7 << 4));
 }
 
+/// Before INAK is cleared a request for transmission is kept, or lost and reported.
+#[test]
+fn a_request_before_the_controller_takes_part_is_lost_with_some_chips() {
+    for (silicon, is_lost) in [(silicon::TYPICAL, false), (silicon::WORST, true)] {
+        let mut bench = Bench::new();
+        bench.can = bench.can.on(silicon);
+        bench.write(MCR, 0x1_0001);
+        let result = bench.can.write(0x180, 0x123 << 21 | 1, bench.now);
+        assert_eq!((result.is_err(), bench.read(TSR) & 1 << 26 != 0), (is_lost, is_lost), "TME0");
+    }
+}
+
 /// A controller that sticks leaves an idle bus, and a busy one by a master reset alone.
 #[test]
 fn a_controller_that_sticks_leaves_a_busy_bus_by_a_master_reset() {

@@ -4,7 +4,7 @@ use super::memory_map::{
     Block, ClockEnable, Place, BLOCKS, DBGMCU, DWT, FPB, ITM, PERIPHERALS, PERIPHERAL_ALIAS, SCS, SRAM_ALIAS,
     SYSCFG_MEMRMP, UNMODELLED,
 };
-use super::Chip;
+use super::{Chip, LateClocks};
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::Effect;
 use crate::costs::CRC_WORD;
@@ -127,6 +127,31 @@ impl Chip {
         }
     }
 
+    /// Whether a block's clock was switched on a moment ago, and nothing has waited for it.
+    fn is_late(&self, enable: ClockEnable) -> bool {
+        let (Some((register, bit)), Some(late)) = (enable, self.late) else { return false };
+        late.register == register && late.bits & 1 << bit != 0 && late.run == self.run_of_code()
+    }
+
+    /// The clocks that were switched on are there.
+    pub fn await_clocks(&mut self) {
+        self.late = None;
+    }
+
+    fn run_of_code(&self) -> (u32, u32, u64) {
+        let (address, len) = self.slice.block;
+        (address, len, self.clock.cycles)
+    }
+
+    /// Whether the run of code has a DSB (ARMv7-M A7.7.34: F3BFh, 8F4Fh), which may stand before any access.
+    fn has_barrier(&self) -> bool {
+        let (address, len) = self.slice.block;
+        let code = self
+            .memory(address)
+            .and_then(|(memory, offset)| memory.bytes().get(offset..offset + len as usize));
+        code.is_some_and(|code| code.windows(4).step_by(2).any(|code| code == [0xBF, 0xF3, 0x4F, 0x8F]))
+    }
+
     fn has_clock(&self, enable: ClockEnable) -> bool {
         enable.is_none_or(|(register, bit)| self.rcc.plain(register) & 1 << bit != 0)
     }
@@ -163,12 +188,21 @@ impl Chip {
     fn load_word(&mut self, address: u32) -> Result<u32, Unmodelled> {
         let now = self.now();
         let result = match self.place(address) {
-            Place::Block { block, offset, enable } if self.has_clock(enable) => {
+            Place::Block { block, offset, enable } if self.has_clock(enable) && !self.is_late(enable) => {
+                if block == Block::Rcc {
+                    // Read back: the core waits for what it has written.
+                    self.late = self.late.filter(|late| late.register != offset);
+                }
                 self.block_mut(block).read(offset, now)
             }
-            Place::Block { block, .. } => {
+            Place::Block { block, enable, .. } => {
                 let name = self.block_mut(block).name();
-                unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0"))
+                let yet = if self.is_late(enable) {
+                    " yet: the register of its clock was not read back"
+                } else {
+                    ""
+                };
+                unmodelled(format!("{name} has no clock{yet} (RCC enables it); it reads as 0"))
             }
             Place::Scs(offset) => {
                 let now = self.clock.time_of(self.cycle_of_access());
@@ -202,12 +236,17 @@ impl Chip {
     fn store_word(&mut self, address: u32, value: u32) -> Result<(), Unmodelled> {
         let now = self.now();
         match self.place(address) {
-            Place::Block { block, offset, enable } if self.has_clock(enable) => {
+            Place::Block { block, offset, enable } if self.has_clock(enable) && !self.is_late(enable) => {
                 self.store_block(block, offset, value, now)
             }
-            Place::Block { block, .. } => {
+            Place::Block { block, enable, .. } => {
                 let name = self.block_mut(block).name();
-                unmodelled(format!("{name} has no clock (RCC enables it); the write is lost"))
+                let yet = if self.is_late(enable) {
+                    " yet: the register of its clock was not read back"
+                } else {
+                    ""
+                };
+                unmodelled(format!("{name} has no clock{yet} (RCC enables it); the write is lost"))
             }
             Place::Scs(offset) => {
                 let now = self.clock.time_of(self.cycle_of_access());
@@ -236,9 +275,15 @@ impl Chip {
             self.exti.settle(levels);
         }
         let caches_data = self.flash.caches_data();
+        let clocks_before = self.rcc.plain(offset);
         let result = self.block_mut(block).write(offset, value, now);
         match block {
             Block::Rcc => {
+                let bits = self.rcc.plain(offset) & !clocks_before;
+                let is_clock = bits != 0 && (rcc::AHB1ENR..=rcc::APB2ENR).contains(&offset);
+                if self.silicon.late_clocks && is_clock && !self.has_barrier() {
+                    self.late = Some(LateClocks { register: offset, bits, run: self.run_of_code() });
+                }
                 self.reset_blocks(resets_before);
                 let changed = self.rcc.clocks() != self.clocks;
                 if changed || offset == rcc::APB1ENR || offset == rcc::APB2ENR {
