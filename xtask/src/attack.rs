@@ -23,8 +23,10 @@ attack. The counts go to target/evidence/attacker.json.
 
 /// The images of the attack, on the board with two programs.
 const IMAGES: &str =
-    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can bootloader-watchdog app-v1 \
+    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can app-v1 \
     app-v2 app-test app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
+/// The images of the stories, on the default board.
+pub const STORIES: &str = "bootloader bootloader-watchdog bootloader-sealed app-v1 app-v2 app-test";
 
 pub fn run(mut args: Args) -> Outcome {
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
@@ -32,7 +34,8 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     let record = if silicon.is_some() { "silicon" } else { "attacker" };
     setup::prepare(&[Part::Firmware, Part::Emulator])?;
-    build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
+    let (board, images) = if silicon.is_some() { (DEFAULT, STORIES) } else { (&TWO, IMAGES) };
+    build::images(board, &images.split_whitespace().collect::<Vec<_>>())?;
     let mut attack = build::tests_program(DEFAULT, "attack");
     for (option, value) in [("--frames", frames), ("--seed", seed), ("--silicon", silicon)] {
         attack.args(value.map(|value| [option.to_owned(), value]).into_iter().flatten());

@@ -7,6 +7,7 @@ use serde_json::json;
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
+use crate::attack::STORIES;
 use crate::setup::{self, Part};
 use crate::{build, coverage, evidence, files, outcome::Outcome, process, workspace};
 
@@ -40,8 +41,7 @@ const WITH_SEALED: &str = "--features=coboot-core/sealed --test-package=coboot-c
                            --cargo-arg=--test=it --cargo-arg=--test=sealed \
                            --cargo-test-arg=-- --cargo-test-arg=objects::";
 
-/// The images of the stories on drawn chips, and how many chips play them.
-const STORIES: &str = "bootloader bootloader-watchdog bootloader-sealed app-v1 app-v2 app-test";
+/// How many chips play the stories.
 const CHIPS: &str = "24";
 
 /// Breaks one rule of the chip at a time, in a clone.
