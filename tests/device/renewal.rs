@@ -216,7 +216,9 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
     let blocks = firmware::blocks(firmware::APP_V1);
     let at = |index| Address::new(index, number());
     let mut lacks_header = false;
-    for (confirmed, operation) in [(true, 7), (true, 8), (true, 2_000), (false, 2_000)] {
+    // The seven words of a record come before the erase.
+    let erase = 7 * u64::from(4 / bsp::FLASH_WIDTH);
+    for (confirmed, operation) in [(true, erase), (true, erase + 1), (true, 2_000), (false, 2_000)] {
         let mut bench = if confirmed { board() } else { Bench::new() };
         if !confirmed {
             bench.switch_on();
