@@ -21,6 +21,7 @@ use crate::periph::gpio::Gpio;
 use crate::periph::i2c::I2c;
 use crate::periph::iwdg::Iwdg;
 use crate::periph::otg::Otg;
+use crate::periph::over_drive::{self, LEAST_SUPPLY};
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
@@ -542,7 +543,13 @@ impl Chip {
     fn check_clocks(&mut self) {
         let Clocks { hclk, pclk1, pclk2, .. } = self.clocks;
         let latency = self.flash.latency();
-        let limits = self.geometry.line.limits_at(self.vdd);
+        let mut limits = self.geometry.line.limits_at(self.vdd);
+        let mut without = "";
+        if self.vdd >= LEAST_SUPPLY && self.pwr.over_drive().is_active(self.now()) {
+            [limits.sysclk, limits.apb1, limits.apb2] = over_drive::LIMITS;
+        } else if self.variant.has_over_drive {
+            without = " without over-drive (PWR_CSR.ODSWRDY)";
+        }
         let needed = (hclk - 1) / limits.per_wait_state;
         let mut wrong = Vec::new();
         if latency < needed {
@@ -554,16 +561,15 @@ impl Chip {
         if hclk > limits.sysclk_after_reset && !self.pwr.is_at_scale_1() {
             wrong.push(format!("HCLK is {hclk} Hz: that needs the regulator at scale 1 (PWR_CR.VOS)"));
         }
-        // Over-drive is not modelled.
         for (name, hz, most) in
             [("HCLK", hclk, limits.sysclk), ("PCLK1", pclk1, limits.apb1), ("PCLK2", pclk2, limits.apb2)]
         {
             if hz > most {
-                wrong.push(format!("{name} is {hz} Hz, the chip's limit is {most}"));
+                wrong.push(format!("{name} is {hz} Hz, the chip's limit is {most}{without}"));
             }
         }
         if !wrong.is_empty() {
-            self.report(Access::Write, RCC_CFGR, 4, 0, self.slice.block.0, wrong.join("; "));
+            self.report(Access::Write, RCC_CFGR, 4, self.rcc.cfgr(), self.slice.block.0, wrong.join("; "));
         }
     }
 

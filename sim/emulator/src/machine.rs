@@ -407,10 +407,11 @@ impl Machine {
         if let Some(until) = chip.slice.hold_until {
             if now < until {
                 let target = chip.next_stop().min(until);
+                let is_flash = chip.flash.busy_until().is_some();
                 self.skip_to(target);
                 let chip = self.cpu.chip_mut();
                 let passed = chip.now() - now;
-                chip.counters.flash_stall_time.0 += passed.0;
+                chip.counters.flash_stall_time.0 += if is_flash { passed.0 } else { 0 };
                 return Entry::Taken;
             }
             chip.slice.hold_until = None;

@@ -59,6 +59,12 @@ pub struct Silicon {
     /// Whether a request for transmission (TXRQ) is lost before the controller takes part in the bus. RM0090 section
     /// 32.4.2 has the software wait for INAK to be cleared, and does not say what happens to one that does not.
     pub can_forgets_requests: bool,
+    /// The time from ODEN to ODRDY, and how long the regulator switches after a change of ODSWEN, in µs: 40 to 100,
+    /// 45 typical with HSI (datasheets of F42x, F446 and F469, over-drive switching characteristics, for ODSWEN).
+    pub over_drive_us: u32,
+    /// The time from LSEON to LSERDY in ms, by the crystal: 2 s typical (datasheet, LSE oscillator
+    /// characteristics). ST's HAL waits for 5 s.
+    pub lse_start_ms: u32,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -79,6 +85,8 @@ pub const TYPICAL: Silicon = Silicon {
     threshold_permille: 500,
     late_clocks: false,
     can_forgets_requests: false,
+    over_drive_us: 45,
+    lse_start_ms: 2_000,
 };
 
 /// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, the first period of
@@ -100,6 +108,8 @@ pub const WORST: Silicon = Silicon {
     threshold_permille: *THRESHOLD.start(),
     late_clocks: true,
     can_forgets_requests: true,
+    over_drive_us: *OVER_DRIVE.end(),
+    lse_start_ms: *LSE_START.end(),
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
@@ -111,6 +121,8 @@ const PLL_FREE: RangeInclusive<u32> = 4_000_000..=64_000_000;
 const CAN_MODE: RangeInclusive<u32> = 0..=30;
 const FLASH_SLOWNESS: RangeInclusive<u32> = 0..=1_000;
 const THRESHOLD: RangeInclusive<u32> = 0..=1_000;
+const OVER_DRIVE: RangeInclusive<u32> = 40..=100;
+const LSE_START: RangeInclusive<u32> = 500..=4_500;
 
 impl Silicon {
     /// A chip that the seed chooses.
@@ -141,6 +153,8 @@ impl Silicon {
             threshold_permille: draw(THRESHOLD),
             late_clocks: draw(0..=1) == 1,
             can_forgets_requests: draw(0..=1) == 1,
+            over_drive_us: draw(OVER_DRIVE),
+            lse_start_ms: draw(LSE_START),
         }
     }
 }
@@ -157,6 +171,7 @@ impl fmt::Display for Silicon {
         let Self { crystal_start_us, pll_free_hz, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
         let Self { threshold_permille: threshold, late_clocks, can_forgets_requests, .. } = self;
+        let Self { over_drive_us, lse_start_ms, .. } = self;
         let of = if self.iwdg_update_prescaled { "prescaled LSI" } else { "LSI" };
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
@@ -168,7 +183,7 @@ impl fmt::Display for Silicon {
              on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}, \
              thresholds of the supply: {threshold} ‰ from lowest to highest, \
              clocks of peripherals are late: {late_clocks}, CAN forgets early requests: \
-             {can_forgets_requests}"
+             {can_forgets_requests}, over-drive: {over_drive_us} µs, crystal of 32 kHz: {lse_start_ms} ms"
         )
     }
 }
@@ -238,6 +253,8 @@ mod tests {
             assert!(chip.can_mode_us <= 30, "{seed}: {chip}");
             assert!(chip.flash_slowness_permille <= 1_000, "{seed}: {chip}");
             assert!(chip.threshold_permille <= 1_000, "{seed}: {chip}");
+            assert!((40..=100).contains(&chip.over_drive_us), "{seed}: {chip}");
+            assert!(chip.lse_start_ms < 5_000, "{seed}: ST's HAL gives up: {chip}");
             assert_eq!(Silicon::drawn(seed), *chip, "{seed}");
         }
         // The ends are reached, or nearly.

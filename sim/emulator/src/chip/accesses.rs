@@ -276,6 +276,7 @@ impl Chip {
         }
         let caches_data = self.flash.caches_data();
         let clocks_before = self.rcc.plain(offset);
+        self.pwr.set_pll_use(self.rcc.pll_use());
         let result = self.block_mut(block).write(offset, value, now);
         match block {
             Block::Rcc => {
@@ -308,7 +309,14 @@ impl Chip {
                 self.attend_bus();
                 self.show_pins();
             }
-            Block::Syscfg | Block::Pwr => self.show_pins(),
+            Block::Syscfg => self.show_pins(),
+            Block::Pwr => {
+                if let Some(until) = self.pwr.over_drive().stall(now) {
+                    self.slice.hold_until = Some(until);
+                    self.slice.leave = true;
+                }
+                self.show_pins();
+            }
             Block::Can1 | Block::Can2 => {
                 if block == Block::Can1 {
                     self.tell_slave();

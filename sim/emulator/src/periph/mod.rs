@@ -7,6 +7,7 @@ pub mod gpio;
 pub mod i2c;
 pub mod iwdg;
 pub mod otg;
+pub mod over_drive;
 pub mod pwr;
 pub mod rcc;
 pub mod syscfg;

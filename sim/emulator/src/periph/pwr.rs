@@ -1,9 +1,10 @@
 //! Power controller (RM0090 section 5, RM0390 section 5).
 
+use crate::periph::over_drive::{OverDrive, CR_OVER_DRIVE};
 use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::silicon::Silicon;
 use crate::supply::{Threshold, NOMINAL};
-use crate::time::Time;
+use crate::time::{Span, Time};
 use crate::variant::Variant;
 
 const CR_DBP: u32 = 1 << 8;
@@ -14,8 +15,6 @@ const CR_CWUF: u32 = 1 << 2;
 const CR_CSBF: u32 = 1 << 3;
 const CR_PVDE: u32 = 1 << 4;
 const CR_PLS: u32 = 0b111 << 5;
-/// On chips that can do 180 MHz.
-const CR_OVER_DRIVE: u32 = 0b11 << 16;
 const CSR_WUF: u32 = 1 << 0;
 const CSR_SBF: u32 = 1 << 1;
 const CSR_PVDO: u32 = 1 << 2;
@@ -48,13 +47,36 @@ pub struct Pwr {
     supply: u32,
     /// PVDO.
     is_low: bool,
+    over_drive: OverDrive,
+    /// Whether the PLL is on, and whether the system clock comes from it.
+    pll_use: (bool, bool),
 }
 
 impl Pwr {
     /// As after a reset, on this chip.
     #[must_use]
     pub fn new(variant: &'static Variant, silicon: Silicon) -> Self {
-        Self { variant, silicon, cr: variant.voltage_scale.1, csr: 0, supply: NOMINAL, is_low: false }
+        let over_drive = OverDrive::new(Span::from_micros(silicon.over_drive_us.into()));
+        let (_, cr) = variant.voltage_scale;
+        let (supply, pll_use) = (NOMINAL, (false, false));
+        Self { variant, silicon, cr, csr: 0, supply, is_low: false, over_drive, pll_use }
+    }
+
+    /// Whether the PLL is on, and whether the system clock comes from it.
+    pub fn set_pll_use(&mut self, pll_use: (bool, bool)) {
+        self.pll_use = pll_use;
+    }
+
+    /// The over-drive of the regulator.
+    #[must_use]
+    pub fn over_drive(&self) -> &OverDrive {
+        &self.over_drive
+    }
+
+    /// CR.DBP: whether the backup domain may be written.
+    #[must_use]
+    pub fn opens_backup_domain(&self) -> bool {
+        self.cr & CR_DBP != 0
     }
 
     /// VDD has this voltage in mV.
@@ -90,7 +112,13 @@ impl Pwr {
 
     /// As after a reset, at the same supply.
     fn fresh(&self) -> Self {
-        Self { supply: self.supply, ..Self::new(self.variant, self.silicon) }
+        let over_drive = self.over_drive.fresh();
+        Self {
+            supply: self.supply,
+            pll_use: self.pll_use,
+            over_drive,
+            ..Self::new(self.variant, self.silicon)
+        }
     }
 
     /// CR.VOS: whether the regulator is at scale 1, which the fastest clocks need.
@@ -138,15 +166,18 @@ impl Peripheral for Pwr {
         "PWR"
     }
 
-    fn read(&mut self, offset: u32, _now: Time) -> Result<u32, Unmodelled> {
+    fn read(&mut self, offset: u32, now: Time) -> Result<u32, Unmodelled> {
         match offset {
-            0x00 => Ok(self.cr),
-            0x04 => Ok(self.csr | CSR_VOSRDY | if self.is_low { CSR_PVDO } else { 0 }),
+            0x00 => Ok(self.cr | self.over_drive.cr()),
+            0x04 => {
+                let pvdo = if self.is_low { CSR_PVDO } else { 0 };
+                Ok(self.csr | CSR_VOSRDY | pvdo | self.over_drive.csr(now))
+            }
             _ => unmodelled("PWR has no such register"),
         }
     }
 
-    fn write(&mut self, offset: u32, value: u32, _now: Time) -> Result<(), Unmodelled> {
+    fn write(&mut self, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
         match offset {
             0x00 => {
                 // CWUF and CSBF read as zero.
@@ -159,8 +190,16 @@ impl Peripheral for Pwr {
                 if (before ^ self.cr) & (CR_PVDE | CR_PLS) != 0 {
                     self.restart_pvd();
                 }
-                if value & CR_OVER_DRIVE != 0 {
-                    return unmodelled("over-drive is not modelled, or the chip has none");
+                if !self.variant.has_over_drive {
+                    if value & CR_OVER_DRIVE != 0 {
+                        return unmodelled(format!("the {} has no over-drive", self.variant.name));
+                    }
+                } else if let Some(wrong) = self.over_drive.write(value, self.pll_use.1, self.supply, now) {
+                    return unmodelled(wrong);
+                }
+                // With two bits, scale 1 to 3, it is so (RM0090 section 5.5.1, RM0402, RM0430, RM0390, RM0386).
+                if (before ^ self.cr) & voltage_scale != 0 && voltage_scale == 3 << 14 && self.pll_use.0 {
+                    return unmodelled("VOS is written while the PLL is on, which is not allowed");
                 }
             }
             0x04 => {

@@ -8,7 +8,6 @@ use crate::variant::{Plain, Variant};
 // Start-up times, typical, from the datasheet (DocID022152 rev 8, section 5.3.8 to 5.3.10).
 const HSI_START: Span = Span(2_200_000);
 const LSI_START: Span = Span::from_micros(15);
-const LSE_START: Span = Span::from_millis(2_000);
 /// The maximum at the upper end of the VCO range.
 const PLL_LOCK: Span = Span::from_micros(200);
 
@@ -250,6 +249,18 @@ impl Rcc {
         self.hse_hz == 0 && self.sws == 1
     }
 
+    /// Whether the PLL is on, and whether the system clock comes from it.
+    #[must_use]
+    pub fn pll_use(&self) -> (bool, bool) {
+        (self.pll.is_on(), self.sws == 2)
+    }
+
+    /// CFGR as software has written it.
+    #[must_use]
+    pub fn cfgr(&self) -> u32 {
+        self.cfgr
+    }
+
     /// Whether the LSI is on.
     #[must_use]
     pub fn lsi_is_on(&self) -> bool {
@@ -414,7 +425,8 @@ impl Peripheral for Rcc {
             }
             0x0C => self.has_failed &= value & CIR_CSSC == 0,
             0x70 => {
-                self.lse.switch(value & BDCR_LSEON != 0, LSE_START, now);
+                let start = Span::from_millis(self.silicon.lse_start_ms.into());
+                self.lse.switch(value & BDCR_LSEON != 0, start, now);
                 self.bdcr_rest = value & 0x0001_8304;
                 if value & BDCR_BDRST != 0 {
                     self.lse = Source::Off;

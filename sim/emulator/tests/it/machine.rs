@@ -6,6 +6,7 @@ mod crystal;
 mod debug;
 mod flash;
 mod option_bytes;
+mod over_drive;
 mod programs;
 mod supply;
 

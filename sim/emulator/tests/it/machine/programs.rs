@@ -78,4 +78,5 @@ programs! {
     RUNS_BY_THE_CACHE,
     LOADS_HIDDEN_CODE,
     STORES_TO_OTP,
+    OVER_DRIVE,
 }
