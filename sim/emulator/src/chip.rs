@@ -24,6 +24,7 @@ use crate::periph::otg::Otg;
 use crate::periph::over_drive::{self, LEAST_SUPPLY};
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
+use crate::periph::rtc::Rtc;
 use crate::periph::syscfg::Syscfg;
 use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
@@ -114,6 +115,7 @@ pub struct Chip {
     i2c: [I2c; 3],
     otg: Otg,
     pwr: Pwr,
+    rtc: Rtc,
     crc: Crc,
     syscfg: Syscfg,
     exti: Exti,
@@ -183,6 +185,7 @@ impl Chip {
             i2c: ["I2C1", "I2C2", "I2C3"].map(I2c::new),
             otg: Otg::default(),
             pwr: Pwr::new(variant, silicon),
+            rtc: Rtc::default(),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
             exti: Exti::default(),
@@ -336,6 +339,7 @@ impl Chip {
     pub fn set_crystal(&mut self, hz: u32) {
         self.hse_hz = hz;
         self.rcc.set_crystal(hz, self.now());
+        self.follow_watchdog();
         self.slice.leave = true;
     }
 
@@ -379,6 +383,7 @@ impl Chip {
     fn lose_power(&mut self) {
         self.rcc = Rcc::new(self.variant, self.hse_hz, self.silicon);
         self.pwr.lose_supply();
+        self.rtc = Rtc::default();
     }
 
     /// Follows VDD.
@@ -420,13 +425,14 @@ impl Chip {
         self.scs.sleeps_deeply().then(|| self.pwr.chooses_standby())
     }
 
-    /// The watchdog forces the LSI on, and the LSI carries its updates out.
+    /// The watchdog forces the LSI on, and the LSI carries its updates out. RTC follows its clock.
     fn follow_watchdog(&mut self) {
         let now = self.now();
         if self.iwdg.is_running() {
             self.rcc.force_lsi(now);
         }
         self.iwdg.follow_lsi(self.rcc.lsi_is_on(), now);
+        self.rtc.follow(self.rcc.rtc_clock(), now);
     }
 
     fn reset_core_domain(&mut self, cause: ResetCause) {

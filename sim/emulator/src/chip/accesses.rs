@@ -11,6 +11,7 @@ use crate::costs::CRC_WORD;
 use crate::memory::PAGE;
 use crate::periph::flash::Store;
 use crate::periph::rcc::{self, ResetCause};
+use crate::periph::rtc::Rtc;
 use crate::peripheral::{unmodelled, Peripheral, Unmodelled};
 use crate::report::{Access, Report};
 use crate::time::Time;
@@ -116,6 +117,7 @@ impl Chip {
             Block::Iwdg => &mut self.iwdg,
             Block::Wwdg => &mut self.wwdg,
             Block::Pwr => &mut self.pwr,
+            Block::Rtc => &mut self.rtc,
             Block::Syscfg => &mut self.syscfg,
             Block::Exti => &mut self.exti,
             Block::Can1 => &mut self.can[0],
@@ -269,6 +271,10 @@ impl Chip {
     }
 
     fn store_block(&mut self, block: Block, offset: u32, value: u32, now: Time) -> Result<(), Unmodelled> {
+        let is_backup = block == Block::Rtc || block == Block::Rcc && offset == rcc::BDCR;
+        if is_backup && !self.pwr.opens_backup_domain() {
+            return unmodelled("the backup domain is write-protected (PWR_CR.DBP): the write is lost");
+        }
         let resets_before = self.reset_bits();
         if block == Block::Exti && !self.exti.listens() {
             let levels = self.exti_levels();
@@ -293,6 +299,9 @@ impl Chip {
                 }
                 if changed {
                     self.check_clocks();
+                }
+                if self.rcc.resets_backup_domain() {
+                    self.rtc = Rtc::default();
                 }
                 self.follow_watchdog();
             }

@@ -53,6 +53,7 @@ pub enum Block {
     Iwdg,
     Wwdg,
     Pwr,
+    Rtc,
     Syscfg,
     Exti,
     Can1,
@@ -79,7 +80,7 @@ pub enum Place {
 pub type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-pub const BLOCKS: [(u32, Block, ClockEnable); 45] = [
+pub const BLOCKS: [(u32, Block, ClockEnable); 46] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -89,6 +90,7 @@ pub const BLOCKS: [(u32, Block, ClockEnable); 45] = [
     (0x4000_1800, Block::Tim(9), Some((rcc::APB1ENR, 6))),
     (0x4000_1C00, Block::Tim(10), Some((rcc::APB1ENR, 7))),
     (0x4000_2000, Block::Tim(11), Some((rcc::APB1ENR, 8))),
+    (0x4000_2800, Block::Rtc, None),
     (0x4000_2C00, Block::Wwdg, Some((rcc::APB1ENR, 11))),
     (0x4000_3000, Block::Iwdg, None),
     (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
@@ -141,8 +143,7 @@ pub const RCC_CFGR: u32 = 0x4002_3808;
 pub const SYSCFG_MEMRMP: u32 = 0x4001_3800;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-pub const UNMODELLED: [(u32, &str); 18] = [
-    (0x4000_2800, "RTC"),
+pub const UNMODELLED: [(u32, &str); 17] = [
     (0x4000_3400, "I2S2ext"),
     (0x4000_3800, "SPI2"),
     (0x4000_3C00, "SPI3"),

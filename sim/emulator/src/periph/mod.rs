@@ -10,6 +10,7 @@ pub mod otg;
 pub mod over_drive;
 pub mod pwr;
 pub mod rcc;
+pub mod rtc;
 pub mod syscfg;
 pub mod tim;
 pub mod usart;

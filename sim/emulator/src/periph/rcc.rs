@@ -45,6 +45,9 @@ const CSR_LPWRRSTF: u32 = 1 << 31;
 
 const BDCR_LSEON: u32 = 1 << 0;
 const BDCR_LSERDY: u32 = 1 << 1;
+/// The choice of the clock of RTC, and its gate.
+const BDCR_RTCSEL: u32 = 0b11 << 8;
+const BDCR_RTCEN: u32 = 1 << 15;
 const BDCR_BDRST: u32 = 1 << 16;
 
 /// Why the chip came out of reset.
@@ -130,6 +133,8 @@ pub const AHB2ENR: u32 = 0x34;
 /// Offset of RCC_DCKCFGR, on the chips that have it.
 const DCKCFGR: u32 = 0x8C;
 const DCKCFGR_TIMPRE: u32 = 1 << 24;
+/// Offset of RCC_BDCR.
+pub const BDCR: u32 = 0x70;
 /// Offset of RCC_APB1ENR.
 pub const APB1ENR: u32 = 0x40;
 /// Offset of RCC_APB2ENR.
@@ -267,6 +272,29 @@ impl Rcc {
         self.lsi.is_on()
     }
 
+    /// The clock of RTC: its frequency in Hz, and the time from which on it is there (section 7.2.8).
+    #[must_use]
+    pub fn rtc_clock(&self) -> Option<(u32, Time)> {
+        let divider = self.cfgr >> 16 & 0x1F;
+        let (source, hz) = match (self.bdcr_rest & BDCR_RTCSEL) >> 8 {
+            1 => (self.lse, 32_768),
+            2 => (self.lsi, self.silicon.lsi_hz),
+            // RTCPRE: 0 and 1 are no clock.
+            3 => (self.hse, if divider > 1 { self.hse_hz / divider } else { 0 }),
+            _ => return None,
+        };
+        match source {
+            Source::On { ready } if hz > 0 && self.bdcr_rest & BDCR_RTCEN != 0 => Some((hz, ready)),
+            _ => None,
+        }
+    }
+
+    /// BDCR.BDRST: whether the backup domain is held in reset.
+    #[must_use]
+    pub fn resets_backup_domain(&self) -> bool {
+        self.bdcr_rest & BDCR_BDRST != 0
+    }
+
     /// The watchdog forces the LSI on (section 21.3).
     pub fn force_lsi(&mut self, now: Time) {
         self.lsi.switch(true, LSI_START, now);
@@ -390,7 +418,7 @@ impl Peripheral for Rcc {
         Ok(match offset {
             0x00 => self.cr(now),
             0x08 => self.cfgr | self.sws << 2,
-            0x70 => self.bdcr_rest | self.lse.bits(BDCR_LSEON, BDCR_LSERDY, now),
+            BDCR => self.bdcr_rest | self.lse.bits(BDCR_LSEON, BDCR_LSERDY, now),
             0x74 => self.csr_flags | self.lsi.bits(CSR_LSION, CSR_LSIRDY, now),
             // CIR; the interrupts of ready clocks: see `write`.
             0x0C if self.has_failed => CIR_CSSF,
@@ -424,13 +452,19 @@ impl Peripheral for Rcc {
                 return unmodelled("the clock interrupts are not modelled");
             }
             0x0C => self.has_failed &= value & CIR_CSSC == 0,
-            0x70 => {
+            BDCR => {
                 let start = Span::from_millis(self.silicon.lse_start_ms.into());
                 self.lse.switch(value & BDCR_LSEON != 0, start, now);
+                let chosen = self.bdcr_rest & BDCR_RTCSEL;
                 self.bdcr_rest = value & 0x0001_8304;
                 if value & BDCR_BDRST != 0 {
                     self.lse = Source::Off;
                     self.bdcr_rest = BDCR_BDRST;
+                } else if chosen != 0 && value & BDCR_RTCSEL != chosen {
+                    self.bdcr_rest = self.bdcr_rest & !BDCR_RTCSEL | chosen;
+                    return unmodelled(
+                        "RTCSEL is chosen until a backup domain reset (BDRST): the chip ignores it",
+                    );
                 }
             }
             0x74 => {

@@ -8,6 +8,7 @@ mod flash;
 mod option_bytes;
 mod over_drive;
 mod programs;
+mod rtc;
 mod supply;
 
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};

@@ -79,4 +79,5 @@ programs! {
     LOADS_HIDDEN_CODE,
     STORES_TO_OTP,
     OVER_DRIVE,
+    RTC,
 }
