@@ -68,7 +68,7 @@ fn a_quote_that_has_changed_is_found() {
 
 /// Commands that are not part of this repository: of a shell, of the system, of other projects.
 const FOREIGN: &str =
-    "cd export ip apt base64 candump canopend cmake cocomm curl dcfgen npm node openssl pip pipx sha256sum tar tshark unzip west";
+    "cd export ip apt sh probe-rs openocd STM32_Programmer_CLI base64 candump canopend cmake cocomm curl dcfgen npm node openssl pip pipx sha256sum tar tshark unzip west";
 /// Cargo's own jobs on pages; their arguments name packages of the workspace.
 const CARGO: [&str; 5] = ["build", "check", "install", "run", "test"];
 

@@ -128,6 +128,27 @@ pub mod tests {
         file
     }
 
+    /// The same with a section of this name.
+    pub fn with_section(name: &str, bytes: &[u8]) -> Vec<u8> {
+        let mut file = by_hand();
+        let (at, names) = (file.len() as u32, format!("\0{name}\0.shstrtab\0"));
+        file.extend(bytes);
+        file.extend(names.as_bytes());
+        file.resize(file.len().next_multiple_of(4), 0);
+        let (size, names_size, headers) = (bytes.len() as u32, names.len() as u32, file.len() as u32);
+        file[32..36].copy_from_slice(&headers.to_le_bytes()); // e_shoff
+        file[46..52].copy_from_slice(&[40, 0, 3, 0, 2, 0]); // e_shentsize, e_shnum, e_shstrndx
+        for header in [
+            // name, type, flags, address, offset, size, link, info, align, entry size
+            [0; 10],
+            [1, 1, 0, 0, at, size, 0, 0, 1, 0], // SHT_PROGBITS
+            [name.len() as u32 + 2, 3, 0, 0, at + size, names_size, 0, 0, 1, 0], // SHT_STRTAB
+        ] {
+            file.extend(header.into_iter().flat_map(u32::to_le_bytes));
+        }
+        file
+    }
+
     const VECTORS: Segment = Segment { offset: 0x100, address: 0x0800_0000, bytes: &[0xAA; 0x20] };
     const DATA: Segment = Segment { offset: 0x120, address: 0x0800_0020, bytes: &[0xAA; 8] };
 

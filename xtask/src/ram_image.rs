@@ -50,6 +50,17 @@ pub fn seal(mut file: Vec<u8>) -> Outcome<Vec<u8>> {
     Ok(file)
 }
 
+/// The CRC in the header of the RAM image in the ELF file of a bootloader.
+///
+/// # Errors
+/// When it is not an ELF file, or has no such header.
+pub fn crc(file: &[u8]) -> Outcome<u32> {
+    let elf = elf::parse(file)?;
+    let header = elf.section_by_name(HEADER).and_then(|section| section.data().ok());
+    let word = header.and_then(|bytes| bytes.get(Header::CRC as usize..)?.first_chunk().copied());
+    word.map(u32::from_le_bytes).ok_or_else(|| format!("it has no section {HEADER} with a header."))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -59,5 +70,6 @@ mod tests {
     fn a_file_without_an_image_is_refused_by_name() {
         assert!(seal(by_hand()).unwrap_err().contains("no section .ram_image"));
         assert!(seal(vec![0; 10]).unwrap_err().contains("no 32-bit"));
+        assert!(crc(&by_hand()).unwrap_err().contains("no section .ram_image"));
     }
 }

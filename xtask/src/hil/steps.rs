@@ -1,14 +1,15 @@
 //! The steps, in their order: the set-up, the conformance checks with the update suite, the ways back, and
 //! what only a board can show. The first one that fails ends the job.
 
-use std::thread::sleep;
+use std::path::Path;
+use std::thread::{self, sleep};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
 use super::bench::{Bench, Done, Hand};
 use super::coflash::{between, Answer, TracedFrame};
-use crate::{files, outcome::Outcome, process};
+use crate::{files, outcome::Outcome, process, ram_image};
 
 /// A step: its name in the report, and what carries it out. The error says why it failed and what to do.
 pub type Step = (&'static str, fn(&mut Bench) -> Outcome<Done>);
@@ -17,8 +18,8 @@ pub type Step = (&'static str, fn(&mut Bench) -> Outcome<Done>);
 pub const STEPS: [Step; 21] = [
     ("open the bus", open_bus),
     ("flash the bootloader by the probe", |bench| flash_bootloader(bench, "bootloader.elf")),
-    ("power off and on, or reset", |bench| bench.restart().map(|how| Done::Passed(how.into()))),
-    ("the device answers, by its crystal", device_answers),
+    ("power off and on, or reset: the boot-up", boot_up),
+    ("the device answers, by its crystal, with what was flashed", device_answers),
     ("conformance: coflash more conform --reset", conform),
     ("option bytes: 2007h/6", option_bytes),
     ("the update suite: coflash more conform UPD --install", update_suite),
@@ -79,10 +80,54 @@ fn flash_bootloader(bench: &mut Bench, name: &str) -> Outcome<Done> {
     passed("")
 }
 
+/// A command that ends well proves nothing: it may have been for another board, or for none. The boot-up does.
+fn boot_up(bench: &mut Bench) -> Outcome<Done> {
+    let bench = &*bench;
+    let (frames, how) = thread::scope(|scope| {
+        let listens = scope.spawn(|| bench.coflash.traced(&["monitor", "--for", "8000"], &bench.work));
+        sleep(Duration::from_secs(1));
+        let how = bench.restart();
+        (listens.join().expect("it does not panic"), how)
+    });
+    let ((_, frames), how) = (frames?, how?);
+    let up = format!("{:X}#00", 0x700 + bench.coflash.node);
+    if frames.iter().any(|one| one.frame == up) {
+        return passed(how);
+    }
+    let why = match frames.is_empty() {
+        true => "The bus is silent: look at pins, transceiver, bit rate and termination, and at the crystal",
+        false => "The device has not restarted: look at the command, and whether it reaches this board",
+    };
+    Err(format!("no boot-up ({up}) after this: {how}. {why}."))
+}
+
+/// That the device has the bootloader of the file: by 100Ah, and by the CRC of its RAM image where it reports one.
+fn is_flashed(bench: &Bench, info: &Value) -> Outcome<String> {
+    let not_flashed = |what: &str, held: &str| {
+        let file = &bench.bootloader;
+        format!("{what} of the device is {held}, not that of {file}: the probe said that all is well, and has not flashed it.")
+    };
+    let file = files::bytes(Path::new(&bench.bootloader))?;
+    let version = info["software_version"].as_str().unwrap_or_default();
+    if version.is_empty() || !file.windows(version.len()).any(|text| text == version.as_bytes()) {
+        return Err(not_flashed("100Ah", &format!("\"{version}\"")));
+    }
+    let Some(number) = info["renewal"]["number"].as_u64() else {
+        return Ok("no CRC, since it has no renewal".into());
+    };
+    let answer = bench.coflash.call(&["read", &format!("1F56/{number}")])?.good()?;
+    let crc = answer.value["number"].as_u64();
+    if crc != Some(ram_image::crc(&file)?.into()) {
+        let held = crc.map_or("unknown".into(), |crc| format!("{crc:08X}h"));
+        return Err(not_flashed("the CRC (1F56h)", &held));
+    }
+    Ok(format!("CRC {:08X}h", crc.unwrap_or_default()))
+}
+
 fn device_answers(bench: &mut Bench) -> Outcome<Done> {
-    let info = bootloader(bench).map_err(|error| {
-        format!("{error} The probe has flashed the bootloader: look at pins, transceiver, bit rate and termination.")
-    })?;
+    let info = bootloader(bench)
+        .map_err(|error| format!("{error} Look at pins, transceiver, bit rate and termination."))?;
+    let crc = is_flashed(bench, &info)?;
     if info["state"]["clock"] == 2 {
         return Err(
             "it runs from its internal oscillator: look at the crystal, and at `hse` of the board file."
@@ -92,7 +137,7 @@ fn device_answers(bench: &mut Bench) -> Outcome<Done> {
     // The conformance checks reset the device, and have more to check in its bootloader.
     bench.coflash.call(&["erase"])?.good()?;
     let word = |key: &str| info[key].as_str().unwrap_or("?").to_owned();
-    passed(format!("\"{}\", version \"{}\"", word("name"), word("software_version")))
+    passed(format!("\"{}\", version \"{}\", {crc}", word("name"), word("software_version")))
 }
 
 fn option_bytes(bench: &mut Bench) -> Outcome<Done> {
@@ -395,5 +440,97 @@ fn info_after_start(bench: &Bench) -> Outcome<Value> {
             return Ok(answer.good()?.value);
         }
         sleep(Duration::from_millis(100));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::bench::HANDS;
+    use super::super::{coflash::Coflash, command::CommandLine};
+    use super::*;
+    use crate::elf::tests::with_section;
+    use crate::workspace;
+
+    /// A coflash that answers with the files of the folder, and a probe that does nothing and ends well.
+    fn bench(folder: &Path, answers: &[(&str, &str)]) -> Bench {
+        for (word, answer) in answers {
+            files::write(&folder.join(word), answer).unwrap();
+        }
+        // A header whose CRC is 12345678h, and the text of 100Ah.
+        let header = [&[0; 4][..], &[0x78, 0x56, 0x34, 0x12], &[0; 56], b"coboot 9.9.9"].concat();
+        let elf = folder.join("bootloader.elf");
+        files::write(&elf, with_section(".ram_image", &header)).unwrap();
+        Bench {
+            board: shared_abi::layout::BOARDS[0],
+            probe: CommandLine::new("--probe", "true {action} {elf}").ok().unwrap(),
+            hands: [const { None }; HANDS.len()],
+            power_line: None,
+            coflash: Coflash {
+                program: workspace::root().join("xtask/src/hil/answers.sh"),
+                bus: folder.display().to_string(),
+                node: 1,
+                rate: 125,
+            },
+            bootloader: elf.display().to_string(),
+            images: folder.into(),
+            work: folder.join("work"),
+            installed: None,
+            conform: Vec::new(),
+        }
+    }
+
+    /// How the three steps after the bus end: the bootloader is flashed, the device restarts, it answers.
+    fn played(name: &str, trace: &str, info: &str) -> Outcome<String> {
+        let folder = std::env::temp_dir().join(format!("hil-{name}-{}", std::process::id()));
+        files::make(&folder).unwrap();
+        let crc = r#"{"number": 305419896}"#;
+        let answers = [("trace", trace), ("monitor", "{}"), ("info", info), ("erase", "{}"), ("read", crc)];
+        let mut bench = bench(&folder, &answers);
+        let mut last = String::new();
+        let ended = STEPS[1..4].iter().try_for_each(|(_, run)| {
+            if let Done::Passed(text) = run(&mut bench)? {
+                last = text;
+            }
+            Ok(())
+        });
+        files::remove(&folder).unwrap();
+        ended.map(|()| last)
+    }
+
+    /// 100Ah is in the file, the CRC of the RAM image is 305419896 = 12345678h.
+    #[test]
+    fn the_exit_code_of_a_probe_is_not_believed() {
+        const UP: &str = "(1.0) can0 701#7F\n(2.0) can0 701#00\n";
+        let info = |version: &str, number: &str| {
+            format!(
+                r#"{{"bootloader": true, "software_version": "{version}", "state": {{}}, "renewal": {number}}}"#
+            )
+        };
+        let good = info("coboot 9.9.9", r#"{"number": 2}"#);
+        let text = played("good", UP, &good).unwrap();
+        assert!(text.contains("coboot 9.9.9") && text.ends_with("CRC 12345678h"), "{text}");
+        let without = played("without", UP, &info("coboot 9.9.9", "null")).unwrap();
+        assert!(without.ends_with("no renewal"), "{without}");
+        // It flashed nothing, and reset nothing: the old bootloader goes on with its heartbeat.
+        let error = played("goes-on", "(1.0) can0 701#7F\n", &good).unwrap_err();
+        assert!(error.contains("701#00") && error.contains("has not restarted"), "{error}");
+        let error = played("silent", "", &good).unwrap_err();
+        assert!(error.contains("silent"), "{error}");
+        // It flashed nothing, and has reset the board.
+        let error = played("older", UP, &info("coboot 0.0.1", "null")).unwrap_err();
+        assert!(error.contains("coboot 0.0.1") && error.contains("has not flashed"), "{error}");
+        let error = played("nameless", UP, r#"{"bootloader": true, "state": {}}"#).unwrap_err();
+        assert!(error.contains("has not flashed"), "{error}");
+    }
+
+    #[test]
+    fn another_build_of_the_same_version_is_found_by_its_crc() {
+        let folder = std::env::temp_dir().join(format!("hil-crc-{}", std::process::id()));
+        files::make(&folder).unwrap();
+        let bench = bench(&folder, &[("read", r#"{"number": 305419897}"#)]);
+        let info = serde_json::json!({"software_version": "coboot 9.9.9", "renewal": {"number": 2}});
+        let error = is_flashed(&bench, &info).unwrap_err();
+        files::remove(&folder).unwrap();
+        assert!(error.contains("12345679h") && error.contains("has not flashed"), "{error}");
     }
 }

@@ -4,9 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use super::build;
 use super::release::{Release, LINUX, SUMS, VERSION};
-use crate::{files, outcome::Outcome, process, setup, workspace};
+use super::{build, IMAGES};
+use crate::{elf, files, outcome::Outcome, process, ram_image, setup, workspace};
 
 /// Checks the sums, with the program that users have for it.
 pub fn sums(dist: &Path) -> Outcome {
@@ -43,6 +43,22 @@ pub fn linux(release: &Release, root: &Path) -> Outcome {
         return Err(format!("the archive has no {file}."));
     }
     works(&folder, "coflash")
+}
+
+/// Each image loads into the flash; that of the bootloader has its CRC.
+pub fn firmware(release: &Release, root: &Path) -> Outcome {
+    files::unpack(&release.firmware(), root)?;
+    let folder = root.join(shared_abi::layout::DEFAULT.board);
+    for image in IMAGES {
+        let file = files::bytes(&folder.join(format!("{image}.elf")))?;
+        let problem = match elf::segments(&file)?.is_empty() {
+            true => "loads nothing",
+            false if image.starts_with("bootloader") && ram_image::crc(&file)? == 0 => "has no CRC",
+            false => continue,
+        };
+        return Err(format!("{image}.elf {problem}."));
+    }
+    Ok(())
 }
 
 pub fn debian(release: &Release, root: &Path) -> Outcome {

@@ -24,6 +24,7 @@ Makes what is handed out, in target/dist. Without a PART it makes all of them:
   deb       the same as a package for Debian and Ubuntu (amd64)
   windows   coflash.exe (x86-64)
   python    the wheel
+  firmware  bootloader and applications of the hardware page for the STM32F407G-DISC1, as ELF files
   sbom      the software bills of materials of coflash and of the bootloader
   crates    the crates for the registry, packaged as `cargo publish` would (in target/dist-build/package)
 
@@ -45,12 +46,13 @@ struct Part {
 }
 
 /// The parts, in the order in which they are made.
-const PARTS: [Part; 7] = [
+const PARTS: [Part; 8] = [
     Part { name: "source", make: source, check: check::source },
     Part { name: "linux", make: linux, check: check::linux },
     Part { name: "deb", make: deb::make, check: check::debian },
     Part { name: "windows", make: windows, check: check::windows },
     Part { name: "python", make: python, check: check::wheel },
+    Part { name: "firmware", make: firmware, check: check::firmware },
     // The job that makes it checks it.
     Part { name: "sbom", make: bills, check: |_, _| Ok(()) },
     Part { name: "crates", make: crates, check: check::crates },
@@ -157,6 +159,23 @@ fn linux(release: &Release) -> Outcome {
         files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
     files::pack(&stage, &name, &release.epoch, &release.linux())?;
+    files::remove(&stage)
+}
+
+/// The images that docs/hardware-checklist.md asks for.
+const IMAGES: [&str; 5] = ["bootloader", "bootloader-watchdog", "app-v1", "app-v2", "app-test"];
+
+/// The images of the default board, and its file.
+fn firmware(release: &Release) -> Outcome {
+    let board = shared_abi::layout::DEFAULT;
+    setup::prepare(&[setup::Part::Firmware])?;
+    let images = crate::build::images(board, &IMAGES)?;
+    let stage = release.empty("stage")?;
+    let names = IMAGES.iter().map(|image| format!("{image}.elf"));
+    for name in names.chain([format!("{}.toml", board.board)]) {
+        files::copy(&images.join(&name), &stage.join(board.board).join(&name))?;
+    }
+    files::pack(&stage, board.board, &release.epoch, &release.firmware())?;
     files::remove(&stage)
 }
 

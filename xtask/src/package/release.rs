@@ -43,6 +43,10 @@ impl Release {
         self.file("-x86_64-windows.exe")
     }
 
+    pub fn firmware(&self) -> PathBuf {
+        self.dist.join(format!("bootloader-{VERSION}-{}.tar.gz", shared_abi::layout::DEFAULT.board))
+    }
+
     /// The wheel, whose name has the oldest C library that it runs on.
     pub fn wheel(&self) -> Outcome<PathBuf> {
         let wheel = files::within(&self.dist)?.into_iter().find(|file| files::is(file, "whl"));
