@@ -118,3 +118,82 @@ fn a_debugger_shuts_a_flash_with_read_out_protection() {
     machine.set_read_protection(0xAA);
     assert!(machine.attach_debugger() && !machine.denies_debugger(0x0800_0000));
 }
+
+/// The hardware page's lines for each tool, and what they make of the option bytes of a chip from the factory (RM0090
+/// section 3.9.10). Those of probe-rs are played: they write registers (section 3.6.2). `BOR_LEV` and `nWRPn` are ST's
+/// names; OpenOCD's `options_write` takes bits 7 to 0 of FLASH_OPTCR, and `flash protect` clears nWRP (its manual).
+#[test]
+fn the_lines_of_the_hardware_page_set_level_2_and_protect_sector_0() {
+    const FACTORY: u32 = 0x0FFF_AAED;
+    const OPTCR: u32 = 0x4002_3C14;
+    let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/hardware-checklist.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    let lines = |start: &'static str| page.lines().filter(move |line| line.starts_with(start));
+    let number = |text: &str| match text.strip_prefix("0x") {
+        Some(digits) => u32::from_str_radix(digits, 16).unwrap(),
+        None => text.parse().unwrap(),
+    };
+    let played = |last_byte: Option<[u32; 2]>| {
+        let mut machine = chip(&STM32F407VG, &programs::STORES_AND_SLEEPS);
+        machine.power_on(Time(0));
+        run_ms(&mut machine, 1);
+        assert_eq!(machine.register(OPTCR), Some(FACTORY));
+        let writes: Vec<_> = lines("probe-rs write --chip STM32F407VG b32 ").collect();
+        assert_eq!(writes.len(), 4);
+        let mut values = last_byte.into_iter().flatten();
+        for line in writes {
+            let words: Vec<_> = line.split_whitespace().skip(5).map(number).collect();
+            let [address, value] = words[..] else { panic!("{line}") };
+            let other = if address == OPTCR { values.next() } else { None };
+            let value = other.map_or(value, |byte| value & !0xFF | byte);
+            machine.poke(address, &value.to_le_bytes()).unwrap();
+            run_ms(&mut machine, 1_000);
+        }
+        machine.power_off();
+        machine.power_on(machine.now());
+        run_ms(&mut machine, 1);
+        machine.register(OPTCR).unwrap()
+    };
+    // Level 2 is 01b.
+    let (level, sector_0) = (0b1100, 1 << 16);
+    let wanted = FACTORY & !level & !sector_0 | 0b0100;
+    assert_eq!(played(None), wanted, "probe-rs");
+
+    let [st] = lines("STM32_Programmer_CLI -c port=SWD ").collect::<Vec<_>>()[..] else { panic!() };
+    let (_, options) = st.split_once(" -ob ").unwrap();
+    let set = |optcr: u32, option: &str| {
+        let (name, value) = option.split_once('=').unwrap();
+        let (bit, width) = match name.strip_prefix("nWRP") {
+            Some(sector) => (16 + number(sector), 1),
+            None => (2, if name == "BOR_LEV" { 2 } else { panic!("{name}") }),
+        };
+        optcr & !(((1 << width) - 1) << bit) | number(value) << bit
+    };
+    assert_eq!(options.split(' ').fold(FACTORY, set), wanted, "{st}");
+
+    let [openocd] = lines("openocd -f board/").collect::<Vec<_>>()[..] else { panic!() };
+    let mut optcr = FACTORY;
+    for command in openocd.split(['"', ';']).map(|command| command.split_whitespace().collect::<Vec<_>>()) {
+        match command[..] {
+            ["stm32f2x", "options_write", "0", bits] => optcr = optcr & !0xFC | number(bits) & 0xFC,
+            ["flash", "protect", "0", first, last, "on"] => {
+                (number(first)..=number(last)).for_each(|sector| optcr &= !(1 << (16 + sector)));
+            }
+            _ => {}
+        }
+    }
+    assert_eq!(optcr, wanted, "{openocd}");
+
+    // The table: level, supply, BOR_LEV, and the three tools.
+    for (row, bor_lev) in [("| 3 |", 0b00), ("| 2 |", 0b01), ("| 1 |", 0b10)] {
+        let cells: Vec<_> =
+            lines(row).last().unwrap().split('|').map(|cell| cell.trim().trim_matches('`')).collect();
+        let [_, _, _, bits, st, openocd, probe, _] = cells[..] else { panic!("{cells:?}") };
+        assert_eq!(bits, format!("{bor_lev:02b}b"));
+        let wanted = wanted & !level | bor_lev << 2;
+        assert_eq!(set(FACTORY & !sector_0, st), wanted, "{st}");
+        assert_eq!(number(openocd), wanted & 0xFC, "{openocd}");
+        let bytes: Vec<_> = probe.split(", ").map(|byte| u32::from_str_radix(byte, 16).unwrap()).collect();
+        assert_eq!(played(Some([bytes[0], bytes[1]])), wanted, "{probe}");
+    }
+}
