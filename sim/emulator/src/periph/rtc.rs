@@ -63,7 +63,7 @@ struct Calendar {
 }
 
 fn bcd(value: u32) -> u32 {
-    value / 10 << 4 | value % 10
+    ((value / 10) << 4) + value % 10
 }
 
 /// A value of two digits, if these are digits.
@@ -84,7 +84,7 @@ impl Calendar {
         for _ in 0..days % CENTURY {
             let last = match self.month {
                 4 | 6 | 9 | 11 => 30,
-                2 if self.year % 4 == 0 => 29,
+                2 if self.year.is_multiple_of(4) => 29,
                 2 => 28,
                 _ => 31,
             };

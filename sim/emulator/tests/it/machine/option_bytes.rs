@@ -187,7 +187,7 @@ fn the_lines_of_the_hardware_page_set_level_2_and_protect_sector_0() {
     // The table: level, supply, BOR_LEV, and the three tools.
     for (row, bor_lev) in [("| 3 |", 0b00), ("| 2 |", 0b01), ("| 1 |", 0b10)] {
         let cells: Vec<_> =
-            lines(row).last().unwrap().split('|').map(|cell| cell.trim().trim_matches('`')).collect();
+            lines(row).next_back().unwrap().split('|').map(|cell| cell.trim().trim_matches('`')).collect();
         let [_, _, _, bits, st, openocd, probe, _] = cells[..] else { panic!("{cells:?}") };
         assert_eq!(bits, format!("{bor_lev:02b}b"));
         let wanted = wanted & !level | bor_lev << 2;
