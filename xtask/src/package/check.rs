@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use super::release::{Release, LINUX, SUMS, VERSION};
-use super::{build, IMAGES};
+use super::build;
+use super::release::{Release, IMAGES, LINUX, SUMS, VERSION};
 use crate::{elf, files, outcome::Outcome, process, ram_image, setup, workspace};
 
 /// Checks the sums, with the program that users have for it.

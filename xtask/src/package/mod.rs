@@ -10,7 +10,7 @@ mod release;
 use std::path::Path;
 use std::process::Command;
 
-use self::release::{Release, SUMS, VERSION, WINDOWS};
+use self::release::{Release, IMAGES, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
 use crate::{files, outcome::Outcome, process, sbom, setup, toolchain, workspace};
 
@@ -161,9 +161,6 @@ fn linux(release: &Release) -> Outcome {
     files::pack(&stage, &name, &release.epoch, &release.linux())?;
     files::remove(&stage)
 }
-
-/// The images that docs/hardware-checklist.md asks for.
-const IMAGES: [&str; 5] = ["bootloader", "bootloader-watchdog", "app-v1", "app-v2", "app-test"];
 
 /// The images of the default board, and its file.
 fn firmware(release: &Release) -> Outcome {

@@ -10,6 +10,8 @@ pub const WINDOWS: &str = "x86_64-pc-windows-gnu";
 /// The version; all members of the workspace have the same one.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 pub const SUMS: &str = "SHA256SUMS";
+/// The images that docs/hardware-checklist.md asks for.
+pub const IMAGES: [&str; 5] = ["bootloader", "bootloader-watchdog", "app-v1", "app-v2", "app-test"];
 
 /// The folders of a release, and the time of its files.
 pub struct Release {
