@@ -553,7 +553,7 @@ impl Chip {
         let mut without = "";
         if self.vdd >= LEAST_SUPPLY && self.pwr.over_drive().is_active(self.now()) {
             [limits.sysclk, limits.apb1, limits.apb2] = over_drive::LIMITS;
-        } else if self.variant.has_over_drive {
+        } else if self.variant.has_over_drive() {
             without = " without over-drive (PWR_CSR.ODSWRDY)";
         }
         let needed = (hclk - 1) / limits.per_wait_state;

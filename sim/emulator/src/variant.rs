@@ -25,13 +25,17 @@ pub struct Variant {
     pub idcode: u32,
     /// PWR_CR.VOS, and its value after a reset.
     pub voltage_scale: (u32, u32),
-    /// Whether the regulator has over-drive, for 180 MHz.
-    pub has_over_drive: bool,
     /// Its column of [`RCC`].
     column: usize,
 }
 
 impl Variant {
+    /// Whether the regulator has over-drive, for 180 MHz: F42x, F43x, F446, F469 and F479.
+    #[must_use]
+    pub fn has_over_drive(&self) -> bool {
+        self.column >= F429.column
+    }
+
     /// The registers of RCC that are kept as written, after a reset.
     pub fn rcc(&self) -> impl Iterator<Item = Plain> + '_ {
         RCC.iter().filter_map(|(at, reset, columns)| {
@@ -87,59 +91,29 @@ const RCC: &[Row] = rows! {
 };
 
 /// STM32F405/407/415/417, device 413h, revision Y (RM0090 section 38.6.1).
-static F407: Variant = Variant {
-    name: "STM32F407",
-    idcode: 0x100F_6413,
-    voltage_scale: (1 << 14, 1 << 14),
-    has_over_drive: false,
-    column: 0,
-};
+static F407: Variant =
+    Variant { name: "STM32F407", idcode: 0x100F_6413, voltage_scale: (1 << 14, 1 << 14), column: 0 };
 
 /// STM32F412, device 441h, revision C (RM0402 section 30.6.1). A reset leaves the regulator at scale 2
 /// (RM0402, PWR_CR).
-static F412: Variant = Variant {
-    name: "STM32F412",
-    idcode: 0x3000_6441,
-    voltage_scale: (3 << 14, 2 << 14),
-    has_over_drive: false,
-    column: 1,
-};
+static F412: Variant =
+    Variant { name: "STM32F412", idcode: 0x3000_6441, voltage_scale: (3 << 14, 2 << 14), column: 1 };
 
 /// STM32F413/423, device 463h, revision A (RM0430, DBGMCU_IDCODE). As for the F412.
-static F413: Variant = Variant {
-    name: "STM32F413",
-    idcode: 0x1000_6463,
-    voltage_scale: (3 << 14, 2 << 14),
-    has_over_drive: false,
-    column: 2,
-};
+static F413: Variant =
+    Variant { name: "STM32F413", idcode: 0x1000_6463, voltage_scale: (3 << 14, 2 << 14), column: 2 };
 
 /// STM32F42x/43x, device 419h, revision 3 (RM0090 section 38.6.1).
-static F429: Variant = Variant {
-    name: "STM32F429",
-    idcode: 0x2001_6419,
-    voltage_scale: (3 << 14, 3 << 14),
-    has_over_drive: true,
-    column: 3,
-};
+static F429: Variant =
+    Variant { name: "STM32F429", idcode: 0x2001_6419, voltage_scale: (3 << 14, 3 << 14), column: 3 };
 
 /// STM32F446, device 421h, revision A (RM0390, DBGMCU_IDCODE).
-static F446: Variant = Variant {
-    name: "STM32F446",
-    idcode: 0x1000_6421,
-    voltage_scale: (3 << 14, 3 << 14),
-    has_over_drive: true,
-    column: 4,
-};
+static F446: Variant =
+    Variant { name: "STM32F446", idcode: 0x1000_6421, voltage_scale: (3 << 14, 3 << 14), column: 4 };
 
 /// STM32F469/479, device 434h, revision A (RM0386, DBGMCU_IDCODE).
-static F469: Variant = Variant {
-    name: "STM32F469",
-    idcode: 0x1000_6434,
-    voltage_scale: (3 << 14, 3 << 14),
-    has_over_drive: true,
-    column: 5,
-};
+static F469: Variant =
+    Variant { name: "STM32F469", idcode: 0x1000_6434, voltage_scale: (3 << 14, 3 << 14), column: 5 };
 
 /// The variant of a chip.
 #[must_use]

@@ -105,7 +105,10 @@ fn boot_up(bench: &mut Bench) -> Outcome<Done> {
 fn is_flashed(bench: &Bench, info: &Value) -> Outcome<String> {
     let not_flashed = |what: &str, held: &str| {
         let file = &bench.bootloader;
-        format!("{what} of the device is {held}, not that of {file}: the probe said that all is well, and has not flashed it.")
+        format!(
+            "{what} of the device is {held}, not that of {file}: the probe said that all is well, and has not \
+             flashed it."
+        )
     };
     let file = files::bytes(Path::new(&bench.bootloader))?;
     let version = info["software_version"].as_str().unwrap_or_default();

@@ -190,7 +190,7 @@ impl Peripheral for Pwr {
                 if (before ^ self.cr) & (CR_PVDE | CR_PLS) != 0 {
                     self.restart_pvd();
                 }
-                if !self.variant.has_over_drive {
+                if !self.variant.has_over_drive() {
                     if value & CR_OVER_DRIVE != 0 {
                         return unmodelled(format!("the {} has no over-drive", self.variant.name));
                     }

@@ -197,7 +197,7 @@ impl Default for Rtc {
 }
 
 impl Rtc {
-    /// RTCCLK is this one from `now` on: its frequency, and the time from which it has edges. Call it after a reset, too.
+    /// RTCCLK is this one from `now` on: its frequency, and the time of its first edge. Call it after a reset, too.
     pub fn follow(&mut self, clock: Option<(u32, Time)>, now: Time) {
         let (hz, from) = clock.unwrap_or((0, now));
         if hz != self.hz {
