@@ -60,7 +60,7 @@ mod app {
     use app_template::bus::carry_out;
     use app_template::objects::Application;
     use bsp::clock::Source;
-    use bsp::{line, pac, CanPort, LAYOUT};
+    use bsp::{functions, line, pac, CanPort, LAYOUT};
     use canopen::slave::Slave;
     use canopen::{Frame, Instant};
     use coboot_app::{Bootloader, Next, ReentryPath};
@@ -145,7 +145,10 @@ mod app {
         match application.proceed(bus_idle) {
             Next::Serve => true,
             Next::Wait => false,
-            Next::Leave(request) => Bootloader::new(LAYOUT).leave(ReentryPath::SystemReset, request),
+            Next::Leave(request) => {
+                functions::before_leaving();
+                Bootloader::new(LAYOUT).leave(ReentryPath::SystemReset, request)
+            }
         }
     }
 
@@ -157,6 +160,11 @@ mod app {
             rtic::pend(pac::Interrupt::CAN1_TX);
             if ticks.is_multiple_of(500 / TICK_MS) {
                 cx.local.led.toggle();
+            }
+            // The board's external watchdog, if it has one. The protocol, which has a higher priority, does not hang
+            // if this runs; ask here what proves that your tasks work, too.
+            if ticks.is_multiple_of(10 / TICK_MS) {
+                functions::each_10_ms();
             }
             ticks = ticks.wrapping_add(1);
             // `delay` would wait for one tick of the clock more.

@@ -408,7 +408,7 @@ mod app {
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
-            cx.local.watchdog.feed();
+            cx.local.watchdog.feed(|| Mono::now().ticks());
             if ticks.is_multiple_of(100 / TICK_MS) {
                 cx.local.led.toggle();
             }
@@ -420,6 +420,7 @@ mod app {
     /// Leaves the bootloader by a reset: the boot stage decides again, on a chip in its reset
     /// state.
     fn reset_with(request: BootRequest) -> ! {
+        bsp::functions::before_leaving();
         product::warm_start_cell().put(request);
         SCB::sys_reset()
     }

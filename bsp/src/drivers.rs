@@ -66,7 +66,7 @@ fn pin<const PORT: char, const NUMBER: u8>(_: &pac::CAN1) -> Pin<PORT, NUMBER> {
     unsafe { core::mem::MaybeUninit::uninit().assume_init() }
 }
 
-/// Enables and resets the ports of the board's pins.
+/// Enables and resets the ports of the board's pins; only enables them on a board that sets pins up itself.
 fn reset_ports(rcc: &mut Rcc) {
     const fn bit(pin: facts::Pin) -> u32 {
         1 << (pin.0 as u32 - 'A' as u32)
@@ -84,6 +84,10 @@ fn reset_ports(rcc: &mut Rcc) {
     // SAFETY: the bits are those of ports (RCC_AHB1ENR and RCC_AHB1RSTR have the same order); the
     // other bits stay. Only `init` uses the ports.
     rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PORTS) });
+    if FACTS.functions.init.is_some() {
+        // What it has set up stays, without an interruption.
+        return;
+    }
     // SAFETY: as above.
     rcc.ahb1rstr().modify(|r, w| unsafe { w.bits(r.bits() | PORTS) });
     // SAFETY: as above.
@@ -141,6 +145,41 @@ fn pulled<T>(port: char, pin: u8, resistor: u32, core: u32, action: impl FnOnce(
     // SAFETY: the original value.
     clocks.write(|w| unsafe { w.bits(before) });
     done
+}
+
+/// Makes a pin an output with this level, for a board's [`Functions`](crate::Functions): a push-pull one without a
+/// resistor, by its registers, since functions have no place for the HAL's pin. Its port keeps its clock.
+pub fn drive(pin: facts::Pin, high: bool) {
+    // SAFETY: nothing that interrupts this uses the register; the other bits stay.
+    let clocks = unsafe { pac::RCC::steal() };
+    // SAFETY: it enables the clock of a port.
+    clocks.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() | 1 << (pin.0 as u32 - 'A' as u32)) });
+    // The port needs two cycles before the first access: reading back takes that long.
+    let _ = clocks.ahb1enr().read();
+    set(pin, high);
+    let moder = port(pin) as *mut u32;
+    let at = 2 * u32::from(pin.1);
+    // SAFETY: the registers of a port with a clock; the other pins stay. The level is set before the pin
+    // becomes an output.
+    unsafe { moder.write_volatile(moder.read_volatile() & !(0b11 << at) | 0b01 << at) };
+}
+
+/// Gives an output ([`drive`]) its other level. It may be interrupted by other uses of the port.
+pub fn toggle(pin: facts::Pin) {
+    // SAFETY: it reads a register of a port, which has no effect.
+    let odr = unsafe { ((port(pin) + 0x14) as *const u32).read_volatile() };
+    set(pin, odr & 1 << pin.1 == 0);
+}
+
+/// The registers of a pin's port.
+const fn port(pin: facts::Pin) -> u32 {
+    0x4002_0000 + 0x400 * (pin.0 as u32 - 'A' as u32)
+}
+
+fn set(pin: facts::Pin, high: bool) {
+    let bsrr = (port(pin) + 0x18) as *mut u32;
+    // SAFETY: it sets or clears the level of one pin, and has no effect on the others (RM0090 section 8.4.7).
+    unsafe { bsrr.write_volatile(1 << (u32::from(pin.1) + if high { 0 } else { 16 })) };
 }
 
 /// The levels of the 16 pins of a port, `'A'` and on; all low for a port that the chip does not

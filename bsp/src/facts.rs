@@ -9,6 +9,7 @@ use shared_abi::wiring::Wiring;
 
 use crate::can::BitTiming;
 use crate::clock::ClockTree;
+use crate::functions::Functions;
 use crate::identity::Identity;
 use crate::voltage;
 
@@ -85,6 +86,8 @@ pub struct Facts {
     pub uart_pins: Pins,
     /// Bit rate of the UART, in bit/s.
     pub uart_bit_rate: u32,
+    /// What the board does, beside what these facts are for; [`Functions::NONE`] for nothing.
+    pub functions: Functions,
 }
 
 /// The entry strap: a pin that asks for the bootloader after a reset.

@@ -10,6 +10,7 @@
 //! |---|---|
 //! | `boards/` | the facts of each board |
 //! | `facts.rs` | what a board says about itself, and what follows from it; the rules are in shared-abi |
+//! | [`functions`] | what a board does |
 //! | `identity.rs` | who the device is: 1008h to 100Ah, 1018h, and the chip's unique identifier |
 //! | [`clock`] | the source of the clocks |
 //! | `pll.rs` | the clock tree in the registers of the chip, and the regulator |
@@ -67,6 +68,7 @@ pub mod supply;
 pub mod uart;
 // The facts use the macro of the UART.
 mod facts;
+pub mod functions;
 #[cfg(all(target_arch = "arm", feature = "virtual-can"))]
 pub mod virtual_can;
 pub mod voltage;
@@ -74,10 +76,11 @@ pub mod voltage;
 pub mod watchdog;
 
 #[cfg(target_arch = "arm")]
-pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
+pub use drivers::{clocks, drive, entry_strap, init, inputs, toggle, Board, Led};
 pub use facts::*;
+pub use functions::Functions;
 #[cfg(not(target_arch = "arm"))]
-pub use host::{cycles, inputs};
+pub use host::{cycles, drive, inputs, toggle};
 pub use identity::{nameplate, serial_number, unique_id, Identity};
 #[cfg(target_arch = "arm")]
 pub use pll::slow_down;
@@ -106,7 +109,10 @@ pub fn pause(core: u32, ms: u32) {
     timer.set_clock_source(cortex_m::peripheral::syst::SystClkSource::Core);
     timer.set_reload(core / 1000 - 1);
     timer.enable_counter();
-    for _ in 0..ms {
+    for passed in 0..ms {
+        if functions::HAS_EACH_10_MS && passed.is_multiple_of(10) {
+            functions::each_10_ms();
+        }
         while !timer.has_wrapped() {
             // A fraction of a millisecond: the timer need not be asked more often.
             cortex_m::asm::delay(1000);

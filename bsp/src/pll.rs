@@ -6,6 +6,7 @@ use stm32f4xx_hal::pac;
 
 use crate::clock::{ClockTree, Source};
 use crate::facts::{CHIP, CLOCK_TREE, INTERNAL, SYSCLK};
+use crate::functions::{each_10_ms, HAS_EACH_10_MS};
 
 const HSEON: u32 = 1 << 16;
 const HSERDY: u32 = 1 << 17;
@@ -141,8 +142,19 @@ fn wait(register: *const u32, bits: u32, value: u32) {
 
 /// Whether bits of a register have a value before they are given up.
 fn reaches(register: *const u32, bits: u32, value: u32) -> bool {
+    /// Checks between two calls of the board's function: 5 to 8 ms at 16 MHz.
+    const PART: u32 = 15_000;
     // SAFETY: the callers pass registers of RCC, PWR and FLASH; reading them has no effect.
-    (0..PATIENCE).any(|_| unsafe { register.read_volatile() } & bits == value)
+    let is_there = |_| unsafe { register.read_volatile() } & bits == value;
+    if !HAS_EACH_10_MS {
+        return (0..PATIENCE).any(is_there);
+    }
+    (0..PATIENCE / PART).any(|_| {
+        (0..PART).any(is_there) || {
+            each_10_ms();
+            false
+        }
+    })
 }
 
 /// Restores the regulator's reset state. The PLL must be off.

@@ -5,6 +5,7 @@ use core::task::Poll;
 
 use boot_core::crc;
 use boot_core::flash::{Flash, FlashFault, Operation};
+use bsp::functions::{self, HAS_EACH_10_MS};
 use bsp::{pac, LAYOUT};
 use shared_abi::geometry::{Region, Sector};
 
@@ -27,10 +28,16 @@ const SHARES_CRC_UNIT: bool = LAYOUT.home.is_some();
 /// The bytes whose CRC is computed while the interrupts of an application wait: some 50 us at 16 MHz.
 const SHARED_STEP: u32 = 512;
 
+/// The bytes whose CRC the unit computes between two looks at the time, for a board that wants to be called each
+/// 10 ms: a millisecond.
+const PART: u32 = 64 * 1024;
+
 /// The controller, and the CRC unit if no other code uses it.
 pub struct ResidentFlash {
     controller: FlashController,
     crc_unit: CrcUnit,
+    /// Whether the boot stage runs, and the board's [`each_10_ms`](functions::Functions::each_10_ms) is called.
+    in_stage: [bool; HAS_EACH_10_MS as usize],
 }
 
 impl ResidentFlash {
@@ -40,7 +47,23 @@ impl ResidentFlash {
     /// Nothing else may use what is taken until this value is dropped.
     pub unsafe fn steal(crc_unit: CrcUnit) -> Self {
         // SAFETY: the caller guarantees it.
-        Self { controller: unsafe { FlashController::steal() }, crc_unit }
+        Self { controller: unsafe { FlashController::steal() }, crc_unit, in_stage: [false; _] }
+    }
+
+    /// The same for the boot stage, which calls the board's functions.
+    ///
+    /// # Safety
+    /// As for [`functions::poll`].
+    pub unsafe fn in_stage(self) -> Self {
+        Self { in_stage: [true; _], ..self }
+    }
+
+    /// Calls the board's function in the boot stage, if it is time.
+    fn poll_board(&self) {
+        if let Some(true) = self.in_stage.first() {
+            // SAFETY: the caller of `in_stage` guarantees it.
+            unsafe { functions::poll() };
+        }
     }
 
     /// Switches the clock of the CRC unit on.
@@ -136,6 +159,7 @@ impl ResidentFlash {
 
 impl Flash for ResidentFlash {
     fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.poll_board();
         self.controller.read(address, buffer);
     }
 
@@ -167,7 +191,13 @@ impl Flash for ResidentFlash {
         if SHARES_CRC_UNIT && is_fit && self.crc_unit == CrcUnit::Shared {
             return Self::crc32_by_parts(crc, region);
         }
-        self.crc32_of(crc, region)
+        if !HAS_EACH_10_MS {
+            return self.crc32_of(crc, region);
+        }
+        (region.base..region.end()).step_by(PART as usize).fold(crc, |crc, at| {
+            self.poll_board();
+            self.crc32_of(crc, Region::new(at, PART.min(region.end() - at)))
+        })
     }
 
     /// The resident part erases nothing: boot stage and application must not wait for it. What needs an erase

@@ -14,7 +14,7 @@ use boot_core::decision::{choose, Exit, Images, PinReset, Start, Store, Woken};
 use boot_core::renewal::Places;
 use boot_core::store::{Key, ProgramRecord};
 use bsp::clock::Source;
-use bsp::{pac, LAYOUT};
+use bsp::{functions, pac, LAYOUT};
 use cortex_m::peripheral::scb::VectActive;
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Words};
@@ -48,12 +48,15 @@ struct Chip {
 /// # Safety
 /// Nothing else may run yet.
 pub unsafe extern "C" fn stage() -> ! {
+    functions::after_reset();
     // SAFETY: nothing else runs yet.
     let mut chip = unsafe { chip() };
     let mut cell = product::warm_start_cell();
     let mut woken = take(&chip.rcc, &mut cell);
     // CRCs need speed, but no exact clock. The crystal would take time to start.
     Source::Internal.speed_up(&chip.rcc);
+    // SAFETY: nothing else runs, and what waits with the timer leaves it off.
+    unsafe { functions::begin(Source::Internal.tree().sysclk()) };
     ResidentFlash::switch_crc_unit_on(&chip.rcc);
     // SAFETY: what else changes the register until it is dropped restores it at once.
     let caches = unsafe { Caches::on() };
@@ -100,7 +103,11 @@ pub unsafe extern "C" fn stage() -> ! {
 unsafe fn chip() -> Chip {
     // SAFETY: nothing else runs.
     let chip = unsafe {
-        Chip { rcc: pac::RCC::steal(), iwdg: pac::IWDG::steal(), flash: ResidentFlash::steal(CrcUnit::Own) }
+        Chip {
+            rcc: pac::RCC::steal(),
+            iwdg: pac::IWDG::steal(),
+            flash: ResidentFlash::steal(CrcUnit::Own).in_stage(),
+        }
     };
     // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
     // 349 at the fastest LSI.
@@ -195,6 +202,10 @@ fn await_second_reset(cell: &mut Cell) {
 
 /// Resets the chip after [`RESET_PERIOD_MS`].
 fn reset_later() -> ! {
+    if functions::HAS_EACH_10_MS {
+        bsp::pause(Source::Internal.tree().sysclk(), RESET_PERIOD_MS);
+        SCB::sys_reset()
+    }
     // One pass of the loop takes three cycles.
     cortex_m::asm::delay(Source::Internal.tree().sysclk() / 1000 * RESET_PERIOD_MS / 3);
     SCB::sys_reset()
@@ -226,8 +237,12 @@ unsafe fn enter_bootloader(
     vectors: VectorTable,
     report: &BootReport,
 ) -> ! {
-    // SAFETY: the caller guarantees it.
-    unsafe { ram_image::copy(place) };
+    // SAFETY: the caller guarantees it. The copy takes less than a millisecond.
+    unsafe {
+        ram_image::copy(place);
+        functions::poll();
+        functions::end();
+    }
     drop(caches);
     if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog.bootloader_ms) {
         // An image that hangs before it starts the watchdog ends, too.
@@ -257,6 +272,10 @@ unsafe fn enter_program(
 ) -> ! {
     let handoff = handoff(woken, start, date(start, parameters, &chip.flash));
     let has_watchdog = chip.flash.starts_watchdog();
+    // SAFETY: from here on nothing polls.
+    unsafe { functions::end() };
+    functions::each_10_ms();
+    functions::before_leaving();
     drop(caches);
     chip.flash.release(&chip.rcc);
     bsp::low_power::release(&chip.rcc);

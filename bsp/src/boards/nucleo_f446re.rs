@@ -1,7 +1,7 @@
 //! NUCLEO-F446RE with a CAN transceiver on PB8 and PB9 (D15 and D14 of the Arduino connector).
 
 use crate::clock::ClockTree;
-use crate::{Facts, Identity, Pins, Pull, Strap};
+use crate::{Facts, Functions, Identity, Pins, Pull, Strap};
 
 /// The facts of this board.
 pub const FACTS: Facts = Facts {
@@ -42,6 +42,7 @@ pub const FACTS: Facts = Facts {
     // The ST-LINK makes them a serial port of the host (UM1724).
     uart_pins: Pins { transmit: ('A', 2), receive: ('A', 3) },
     uart_bit_rate: 115_200,
+    functions: Functions::NONE,
 };
 
 can_controller!(CAN1);

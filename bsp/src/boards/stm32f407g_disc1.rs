@@ -1,7 +1,7 @@
 //! STM32F407G-DISC1 with a CAN transceiver on PD0 and PD1.
 
 use crate::clock::ClockTree;
-use crate::{Facts, Identity, Pins, Pull, Strap};
+use crate::{Facts, Functions, Identity, Pins, Pull, Strap};
 
 /// The facts of this board.
 pub const FACTS: Facts = Facts {
@@ -37,6 +37,7 @@ pub const FACTS: Facts = Facts {
     // They are free on this board (UM1472).
     uart_pins: Pins { transmit: ('A', 2), receive: ('A', 3) },
     uart_bit_rate: 115_200,
+    functions: Functions::NONE,
 };
 
 can_controller!(CAN1);

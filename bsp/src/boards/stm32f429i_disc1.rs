@@ -5,7 +5,7 @@
 //! to inputs. So PB8 and PB9 are free as long as the display is not used.
 
 use crate::clock::ClockTree;
-use crate::{Facts, Identity, Pins, Pull, Strap};
+use crate::{Facts, Functions, Identity, Pins, Pull, Strap};
 
 /// The facts of this board.
 pub const FACTS: Facts = Facts {
@@ -43,6 +43,7 @@ pub const FACTS: Facts = Facts {
     // The ST-LINK makes them a serial port of the host (UM1670).
     uart_pins: Pins { transmit: ('A', 9), receive: ('A', 10) },
     uart_bit_rate: 115_200,
+    functions: Functions::NONE,
 };
 
 can_controller!(CAN1);

@@ -1,0 +1,104 @@
+//! What a board does: the functions of its file.
+
+use crate::facts::FACTS;
+#[cfg(target_arch = "arm")]
+use cortex_m::peripheral::{syst::SystClkSource, SYST};
+
+/// The functions of a board (docs/porting.md, "A board's own functions"). One that is `None` costs nothing.
+///
+/// Each runs in the resident part of the bootloader, from flash, and in its RAM image, where code and constants
+/// are in RAM and the flash may be busy; [`each_10_ms`](Self::each_10_ms) and
+/// [`before_leaving`](Self::before_leaving) in the application template, too. So they use neither the flash
+/// controller, nor interrupts, nor a `static` (with one, the resident part does not link: an application owns the
+/// RAM), nor an address in flash, and return within a millisecond.
+#[derive(Clone, Copy, Debug)]
+pub struct Functions {
+    /// The first thing after each reset, when the core runs from HSI: a pin that holds the power, outputs that are
+    /// safe. An application that jumps to the bootloader leads here, too. The boot stage leaves what it has set up to
+    /// the bootloader and to the programs, which find all else as after a reset.
+    pub init: Option<fn()>,
+    /// At most 10 ms after the call before, as long as the software proves that it works; some ms later in a RAM
+    /// image that computes. To be toggled: an external watchdog.
+    pub each_10_ms: Option<fn()>,
+    /// Before a program starts, and before a reset that bootloader or application make themselves.
+    pub before_leaving: Option<fn()>,
+}
+
+impl Functions {
+    /// A board that has facts alone.
+    pub const NONE: Self = Self { init: None, each_10_ms: None, before_leaving: None };
+}
+
+/// Whether the board has [`Functions::each_10_ms`].
+pub const HAS_EACH_10_MS: bool = FACTS.functions.each_10_ms.is_some();
+
+/// Calls [`Functions::init`], if the board has it; so do the other two.
+#[inline(always)]
+pub fn after_reset() {
+    if let Some(init) = FACTS.functions.init {
+        init();
+    }
+}
+
+/// See [`Functions::each_10_ms`].
+#[inline(always)]
+pub fn each_10_ms() {
+    if let Some(each_10_ms) = FACTS.functions.each_10_ms {
+        each_10_ms();
+    }
+}
+
+/// See [`Functions::before_leaving`].
+#[inline(always)]
+pub fn before_leaving() {
+    if let Some(before_leaving) = FACTS.functions.before_leaving {
+        before_leaving();
+    }
+}
+
+/// Begins to count 10 ms after 10 ms with the system timer, for [`poll`]. The core runs at `core` Hz.
+///
+/// # Safety
+/// Nothing else uses the timer until [`end`].
+#[cfg(target_arch = "arm")]
+pub unsafe fn begin(core: u32) {
+    if HAS_EACH_10_MS {
+        // SAFETY: the caller guarantees it.
+        let mut timer = crate::cleared_systick(unsafe { systick() });
+        timer.set_clock_source(SystClkSource::Core);
+        timer.set_reload(core / 100 - 1);
+        timer.enable_counter();
+    }
+}
+
+/// Calls [`Functions::each_10_ms`] if 10 ms have passed.
+///
+/// # Safety
+/// Only between [`begin`] and [`end`].
+#[cfg(target_arch = "arm")]
+pub unsafe fn poll() {
+    // SAFETY: the caller guarantees it.
+    if HAS_EACH_10_MS && unsafe { systick() }.has_wrapped() {
+        each_10_ms();
+    }
+}
+
+/// Leaves the timer off, as after a reset.
+///
+/// # Safety
+/// As for [`poll`].
+#[cfg(target_arch = "arm")]
+pub unsafe fn end() {
+    if HAS_EACH_10_MS {
+        // SAFETY: the caller guarantees it; the value after a reset (PM0214 section 4.5.1).
+        unsafe { systick().csr.write(0) };
+    }
+}
+
+/// # Safety
+/// Nothing else uses the timer.
+#[cfg(target_arch = "arm")]
+unsafe fn systick() -> SYST {
+    // SAFETY: the caller guarantees it.
+    unsafe { cortex_m::Peripherals::steal() }.SYST
+}
