@@ -21,6 +21,10 @@ choices! {
         programs: Autostart = Autostart::InOrder => [Autostart::Function(|| &[1])];
         /// The number of crashes in a row after which the device stays in the bootloader, 1 to 255.
         max_crash_resets: u32 = 3 => [1];
+        /// Whether a reset by the NRST pin counts as one by the watchdog does: for a board with a
+        /// [watchdog chip](porting.md#a-watchdog-chip), which resets by that pin. A reset button and a
+        /// debug probe then count, too; a power-on begins a new count, as ever.
+        pin_resets_are_crashes: bool = false => [true];
         /// How long the bootloader listens before it starts a program that was never confirmed, in
         /// ms, less than the period of the heartbeat; 0 for not at all. An SDO request to the node or
         /// any layer setting service in this time keeps the device in the bootloader.

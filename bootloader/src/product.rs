@@ -446,6 +446,7 @@ impl Product {
             autostart: start.programs,
             programs: &PROGRAMS,
             max_crash_resets: start.max_crash_resets,
+            pin_resets_are_crashes: start.pin_resets_are_crashes,
             node_ids: *self.node.ids.start()..=*self.node.ids.end(),
             rescue_window_ms: start.rescue_window_ms,
             rescue_window_confirmed_ms: start.rescue_window_confirmed_ms,

@@ -330,6 +330,8 @@ pub struct Policy {
     pub programs: &'static [u8],
     /// After this many consecutive crash resets, the device stays in the bootloader.
     pub max_crash_resets: u32,
+    /// A reset by the pin counts as one by the watchdog: a watchdog chip of the board resets by it.
+    pub pin_resets_are_crashes: bool,
     /// The node-IDs with which a program may start.
     pub node_ids: RangeInclusive<u8>,
     /// The rescue window, in ms: how long a program that was never confirmed is held back when it
@@ -365,6 +367,7 @@ impl Policy {
             autostart: Autostart::InOrder,
             programs,
             max_crash_resets: 3,
+            pin_resets_are_crashes: false,
             node_ids: 1..=127,
             rescue_window_ms: 0,
             rescue_window_confirmed_ms: 0,
@@ -379,9 +382,15 @@ impl Policy {
 
     /// The number of consecutive resets by which the application ended without a request, including
     /// this one if it is one; `before` is the count up to now. A request resets the count. A
-    /// power-on or the reset pin resets it, too, unless the limit was already reached.
+    /// power-on or the reset pin resets it, too, unless the limit was already reached, or the pin is
+    /// that of a watchdog chip.
     fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
-        use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
+        use ResetCause::{IndependentWatchdog, LowPower, Pin, Software, WindowWatchdog};
+        let is_crash = match cause {
+            IndependentWatchdog | WindowWatchdog | Software | LowPower => true,
+            Pin => self.pin_resets_are_crashes,
+            _ => false,
+        };
         match request {
             Some(
                 BootRequest::Fault
@@ -390,7 +399,7 @@ impl Policy {
                 | BootRequest::Renewal(_),
             ) => before,
             Some(_) => 0,
-            None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
+            None if is_crash => {
                 // A device that resets for ever does not wear its flash out.
                 before.saturating_add(1).min(self.max_crash_resets.max(MOST_CRASHES))
             }

@@ -108,6 +108,7 @@ fn products() -> Vec<(Policy, bool)> {
         (plain.clone(), false),
         (Policy { autostart: Autostart::List(&[2, 1]), two_resets: true, ..plain.clone() }, true),
         (Policy { autostart: Autostart::List(&[]), max_crash_resets: 1, ..plain.clone() }, false),
+        (Policy { pin_resets_are_crashes: true, ..plain.clone() }, false),
         (
             Policy {
                 autostart: Autostart::Function(|| &[7, 2]),
@@ -338,7 +339,8 @@ impl Facts<'_> {
     /// The count of crashes from now on.
     fn crashes(&self) -> u32 {
         let Row { crashes, cause, .. } = *self.row;
-        let is_crash = matches!(cause, Software | IndependentWatchdog | WindowWatchdog | LowPower);
+        let is_crash = matches!(cause, Software | IndependentWatchdog | WindowWatchdog | LowPower)
+            || cause == Pin && self.policy.pin_resets_are_crashes;
         match self.asks_nothing() {
             // What the bootloader itself has left.
             false if self.asks(&[4, 6, 8, 13]) => crashes,
