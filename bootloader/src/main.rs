@@ -382,6 +382,9 @@ mod app {
             pending_reset.at = Some(now + PRODUCT.nmt.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
             log!("longest between two feeds; us", log::feeds::longest());
+            if bsp::functions::HAS_EACH_10_MS {
+                log!("longest each_10_ms; us", log::feeds::slowest());
+            }
         }
     }
 

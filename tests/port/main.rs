@@ -7,3 +7,5 @@ mod can_driver;
 mod matrix;
 #[cfg(reference_board)]
 mod porting;
+#[cfg(reference_board)]
+mod watchdog_chip;

@@ -21,18 +21,18 @@ use shared_abi::layout;
 const TARGET: &str = "thumbv7em-none-eabihf";
 
 /// A copy of the repository.
-struct Copy {
-    root: PathBuf,
+pub struct Copy {
+    pub root: PathBuf,
     /// Cargo's folder for the copy. Cargo identifies packages by their place in the workspace, so a
     /// folder that is shared with another copy would be rebuilt each time.
-    target: PathBuf,
+    pub target: PathBuf,
     _alone: Alone,
 }
 
 impl Copy {
     /// The copy of an earlier run is updated: unchanged files keep their time, so that cargo
     /// rebuilds only what it must.
-    fn new() -> Self {
+    pub fn new() -> Self {
         let tmp = Path::new(env!("CARGO_TARGET_TMPDIR")).join("porting");
         let alone = Alone::at(&tmp.join("lock"));
         let (root, target) = (tmp.join("copy"), tmp.join("target"));
@@ -40,7 +40,9 @@ impl Copy {
         if !target.exists() {
             share("debug", &target.join("debug"));
             for profile in ["release", "thumbv7em-none-eabihf/firmware"] {
-                share(&format!("fw/stm32f407/{profile}"), &target.join("fw/stm32f405").join(profile));
+                for chip in ["stm32f405", "stm32f407"] {
+                    share(&format!("fw/stm32f407/{profile}"), &target.join("fw").join(chip).join(profile));
+                }
             }
         }
         Self { root, target, _alone: alone }
@@ -67,7 +69,7 @@ impl Copy {
     }
 
     /// Replaces `old`, which must be there once, by `new`; returns the previous file.
-    fn edit(&self, file: &str, old: &str, new: &str) -> String {
+    pub fn edit(&self, file: &str, old: &str, new: &str) -> String {
         let path = self.root.join(file);
         let before = fs::read_to_string(&path).expect(file);
         assert_eq!(before.matches(old).count(), 1, "{file}: {old:?}");
@@ -349,7 +351,7 @@ fn a_board_is_made_for_every_chip() {
 
 impl Copy {
     /// Runs a job of the copy; returns its output.
-    fn xtask(&self, words: &[&str]) -> String {
+    pub fn xtask(&self, words: &[&str]) -> String {
         let output = self.cargo(&[&["run", "-q", "-p", "xtask", "--"], words].concat());
         assert!(output.status.success(), "cargo xtask {}:\n{}", words.join(" "), text(&output));
         text(&output)

@@ -18,6 +18,8 @@ const FULL: u32 = 0xFF_FFFF;
 /// The time of the last feed, in us of the monotonic.
 static FED: AtomicU32 = AtomicU32::new(0);
 static LONGEST: AtomicU32 = AtomicU32::new(0);
+/// The longest call of the board's function, in us.
+static SLOWEST: AtomicU32 = AtomicU32::new(0);
 
 /// Starts the clocks, from HSI: the watchdog runs, and the monotonic does not yet. A crystal that does not
 /// start takes longest.
@@ -44,6 +46,21 @@ pub fn fed() {
         let passed = now.wrapping_sub(FED.swap(now, Ordering::Relaxed));
         LONGEST.fetch_max(passed, Ordering::Relaxed);
     }
+}
+
+/// Calls the board's function, which all tasks of its priority wait for.
+pub fn during_board(each_10_ms: impl FnOnce()) {
+    if !ON {
+        return each_10_ms();
+    }
+    let from = now();
+    each_10_ms();
+    SLOWEST.fetch_max(now().wrapping_sub(from), Ordering::Relaxed);
+}
+
+/// Its longest call so far, in us.
+pub fn slowest() -> u32 {
+    SLOWEST.load(Ordering::Relaxed)
 }
 
 /// The longest time so far, in us.

@@ -8,6 +8,7 @@ use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bus::node::Pins;
 use crate::bxcan::{self, BxCan};
+use crate::circuit::Wired;
 use crate::clock::CycleClock;
 use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::{NMI, SYS_TICK};
@@ -66,6 +67,8 @@ pub struct Counters {
     pub flash_stall_time: Span,
     /// The longest time between two feeds of the independent watchdog since the machine was made.
     pub longest_between_feeds: Span,
+    /// The same between two changes of the level at the pin of a watchdog chip.
+    pub longest_between_toggles: Span,
 }
 
 /// Peripherals whose clocks software has just switched on ([`Silicon::late_clocks`]).
@@ -106,6 +109,7 @@ pub struct Chip {
     wwdg: Wwdg,
     /// The ports.
     pub gpio: Vec<Gpio>,
+    pub(crate) circuit: Wired,
     /// CAN1 and CAN2.
     pub can: [BxCan; 2],
     /// The USARTs, as in [`usart::INSTANCES`].
@@ -179,6 +183,7 @@ impl Chip {
             iwdg: Iwdg::new(silicon),
             wwdg: Wwdg::default(),
             gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
+            circuit: Wired::new(options.circuit),
             can: [BxCan::new().on(silicon), BxCan::slave().on(silicon)],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             tims: tim::INSTANCES.each_ref().map(Tim::new),
@@ -208,6 +213,7 @@ impl Chip {
                 flash_stalls: 0,
                 flash_stall_time: Span(0),
                 longest_between_feeds: Span(0),
+                longest_between_toggles: Span(0),
             },
             slice: Slice::default(),
             hse_hz: options.hse_hz,
@@ -312,6 +318,9 @@ impl Chip {
     /// A system reset of everything but the CPU: RAM stays, the flags in RCC_CSR gather.
     pub fn reset(&mut self, cause: ResetCause) {
         self.rcc.note_reset(cause);
+        if cause == ResetCause::Pin {
+            self.circuit.pin_reset(self.now());
+        }
         self.iwdg.reset();
         match cause {
             ResetCause::Standby => self.pwr.leave_standby(),
@@ -474,6 +483,7 @@ impl Chip {
         self.clock = CycleClock::new(now, self.silicon.hsi_hz);
         self.lose_power();
         self.supervisor = Supervisor::new(self.silicon);
+        self.circuit.power_on(now);
         self.counters.resets = 0;
         self.slice.attention = false;
         self.reset(ResetCause::PowerOn);
@@ -519,10 +529,11 @@ impl Chip {
         slave.follow(master, clocked);
     }
 
-    /// Finds the pins that the program has assigned to the USARTs and the CAN controllers.
+    /// Finds the pins that the program has assigned to the USARTs and the CAN controllers, and what it drives.
     fn wire_pins(&mut self) {
         let now = self.now();
-        let Self { gpio, usarts, can, geometry, .. } = self;
+        let Self { gpio, usarts, can, geometry, circuit, .. } = self;
+        circuit.look(now, |(port, pin)| gpio.get(port as usize - 'A' as usize)?.driven(pin));
         let function_of =
             |port: char, pin: u8| gpio.get(port as usize - 'A' as usize).and_then(|port| port.alternate(pin));
         let is_given = |&(port, pin, function): &(char, u8, u8)| function_of(port, pin) == Some(function);
@@ -612,6 +623,9 @@ impl Chip {
         if self.iwdg.has_expired() {
             self.slice.reset_request = Some(ResetCause::IndependentWatchdog);
             self.slice.leave = true;
+        } else if self.circuit.bites(now) {
+            self.slice.reset_request = Some(ResetCause::Pin);
+            self.slice.leave = true;
         } else if self.wwdg.has_expired() {
             self.slice.reset_request = Some(ResetCause::WindowWatchdog);
             self.slice.leave = true;
@@ -669,6 +683,7 @@ impl Chip {
             self.rcc.next_event(),
             self.scs.systick.next_event(),
             self.supply.next_change(self.now()),
+            self.circuit.next_event(),
         ]
         .into_iter()
         .chain(self.usarts.iter().map(Peripheral::next_event))

@@ -14,6 +14,7 @@
 //! | [`variant`] | how the lines of the family differ |
 //! | [`silicon`] | what the manuals leave open: the values of one chip |
 //! | [`supply`] | VDD, and the resets by it |
+//! | [`circuit`] | what a board has at the pins: a watchdog chip, a latch for the power |
 //! | [`memory`], [`clock`], [`noise`] | memory of host and chip, cycles as time, random values by a seed |
 //! | [`options`], [`error`], [`report`] | set-up, errors, accesses that are wrong or not modelled |
 //! | [`bus`], [`frame`] | the CAN bus: arbitration, errors, faults; frames and their bits |
@@ -26,6 +27,7 @@ pub mod bus;
 pub mod bxcan;
 pub mod candump;
 pub mod chip;
+pub mod circuit;
 pub mod clock;
 pub mod control;
 pub mod cortex;

@@ -37,7 +37,7 @@ pub enum Stop {
     Attention,
     /// The chip went through a reset; it is at its first instruction again.
     Reset(ResetCause),
-    /// The armed power cut happened; the machine is off.
+    /// The armed power cut happened, or the board's latch was let go; the machine is off.
     PowerCut,
     /// The CPU has locked up: a fault within the HardFault handler. Only a reset (by the watchdog,
     /// for example) ends it. It is reported once; the machine can be run on.
@@ -374,7 +374,7 @@ impl Machine {
             }
             let chip = self.cpu.chip_mut();
             chip.advance();
-            if chip.flash.power_has_failed() {
+            if chip.flash.power_has_failed() || chip.circuit.lets_go(chip.now()) {
                 self.power_off();
                 return Stop::PowerCut;
             }
@@ -785,6 +785,7 @@ impl Machine {
         Counters {
             cycles: chip.clock.cycles,
             longest_between_feeds: chip.iwdg.longest_between_feeds(),
+            longest_between_toggles: chip.circuit.longest(),
             ..chip.counters.clone()
         }
     }

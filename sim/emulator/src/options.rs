@@ -1,5 +1,6 @@
 //! The set-up of a machine.
 
+use crate::circuit::Circuit;
 use crate::periph::flash::FlashTimes;
 use crate::silicon::{self, Silicon};
 use crate::supply;
@@ -25,6 +26,8 @@ pub struct Options {
     pub silicon: Silicon,
     /// VDD at power-on, in mV.
     pub vdd_mv: u32,
+    /// What the board has at the pins.
+    pub circuit: Circuit,
 }
 
 impl Default for Options {
@@ -38,6 +41,7 @@ impl Default for Options {
             costs: false,
             silicon: silicon::TYPICAL,
             vdd_mv: supply::NOMINAL,
+            circuit: Circuit::default(),
         }
     }
 }

@@ -69,18 +69,21 @@ impl Gpio {
         }
     }
 
+    /// The level that the program drives at `pin`, if it does.
+    #[must_use]
+    pub fn driven(&self, pin: u8) -> Option<bool> {
+        let bit = 1u16 << (pin & 15);
+        let (high, open_drain) = (self.odr & bit != 0, self.otyper & u32::from(bit) != 0);
+        (Self::field(self.moder, pin) == OUTPUT && !(open_drain && high)).then_some(high)
+    }
+
     /// The level at `pin`. A push-pull output wins over the outside; an open-drain one pulls low
     /// only; a floating pin reads low.
     #[must_use]
     pub fn level(&self, pin: u8) -> bool {
         let bit = 1u16 << (pin & 15);
-        let mode = Self::field(self.moder, pin);
-        if mode == OUTPUT {
-            let high = self.odr & bit != 0;
-            let open_drain = self.otyper & u32::from(bit) != 0;
-            if !open_drain || !high {
-                return high;
-            }
+        if let Some(level) = self.driven(pin) {
+            return level;
         }
         if self.outside.driven & bit != 0 {
             return self.outside.level & bit != 0;

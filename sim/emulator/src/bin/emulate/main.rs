@@ -396,6 +396,7 @@ impl Bench {
                     transceiver: usize::from(args.can.unwrap_or(circuit.can)) - 1,
                     silicon: args.silicon.unwrap_or(Choice::Typical).of_board(n.into()),
                     vdd_mv: args.vdd,
+                    ..Options::default()
                 },
             );
             let mut machine = machine.context("setting up the board")?;
