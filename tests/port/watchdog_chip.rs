@@ -8,6 +8,9 @@ use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::listener::Listener;
 use coboot_tests::renewal::{self, version};
+use coflash_core::file::checksum::Checksum;
+use coflash_core::file::convert::{self, Region};
+use coflash_core::file::read::{read, Format};
 use coflash_core::update::{flash, FlashOptions};
 use emulator::circuit::Circuit;
 use emulator::machine::{Cut, FlashCut, Options, ResetCause, Stop};
@@ -182,8 +185,7 @@ fn a_task_hangs(images: &Images, watchdog_ms: u64) {
     bench.replace_idle(0xE7FE);
     bench.run_ms(400);
     let events = bench.events();
-    let (at, stop) = events[0];
-    assert_eq!(stop, Stop::Reset(ResetCause::Pin));
+    let [(at, Stop::Reset(ResetCause::Pin)), ..] = events[..] else { panic!("{events:?}") };
     // The proof is good for 50 ms, the chip waits from the last toggle on.
     let range = watchdog_ms..=watchdog_ms + 50;
     assert!(range.contains(&((at - hung).0 / Span::from_millis(1).0)), "{:?}", at - hung);
@@ -214,6 +216,32 @@ fn a_confirmed_program_hangs(images: &Images, watchdog_ms: u64) {
     // It goes on as after any crash loop.
     bench.start_program();
     assert!(!bench.is_bootloader(NODE));
+}
+
+/// A CRC-16, which software computes, over a program of half a mebibyte: the boot stage takes longer than the chip waits.
+fn a_long_crc(copy: &Copy, images: &Images) {
+    let product = std::fs::read_to_string(copy.root.join(FILES[2].1)).expect("it was copied");
+    let crc_16 = "download: Download { crc: CrcKind::Crc16, ..Download::DEFAULT }, ..Product::DEFAULT";
+    let product = product.replace("..Product::DEFAULT", crc_16);
+    std::fs::write(copy.root.join("bootloader/products/bites-crc-16.rs"), product)
+        .expect("it can be written");
+    copy.xtask(&["build", "bootloader", "--product", "bites-crc-16", "--board", "watchdog-chip"]);
+    let bootloader = path(copy, "bootloader-bites-crc-16.elf");
+    let mut bench = device(&bootloader, WATCHDOG_MS[1], Options::default()).switched_on();
+    let place = firmware::board().programs[0];
+    let mut bytes = firmware::raw(&images.v1);
+    bytes.resize(512 * 1024, 0x5A);
+    let image = read(&bytes, Some(Format::Raw), Some(place.base)).expect("bytes at an address");
+    let options = convert::Options::default().region(Region::Strict(place.into())).checksum(Checksum::Crc16);
+    let file = convert::program_of(image, &options).expect("it fits").program;
+    flash(&mut bench.session(), file, &FlashOptions::default(), &mut |_| {}).expect("an update");
+    bench.power_off();
+    bench.run_ms(100);
+    let took = bench.power_on_to_first_instruction();
+    assert!(took > Span::from_millis(WATCHDOG_MS[1]), "{took:?}");
+    bench.await_program(100);
+    assert!(!bench.is_bootloader(NODE));
+    assert_quiet(&mut bench, 0);
 }
 
 /// A function that takes 5 ms of each 10: the log says so, and the bootloader answers all the same.
@@ -271,6 +299,8 @@ fn a_board_with_a_watchdog_chip_keeps_it_quiet_and_its_power_on() {
         println!("{ms} ms: a confirmed program hangs");
         a_confirmed_program_hangs(&images, ms);
     }
+    println!("a long CRC");
+    a_long_crc(&copy, &images);
     println!("a slow function");
     a_slow_function(&copy);
 }
