@@ -386,11 +386,6 @@ impl Policy {
     /// that of a watchdog chip.
     fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Pin, Software, WindowWatchdog};
-        let is_crash = match cause {
-            IndependentWatchdog | WindowWatchdog | Software | LowPower => true,
-            Pin => self.pin_resets_are_crashes,
-            _ => false,
-        };
         match request {
             Some(
                 BootRequest::Fault
@@ -399,7 +394,9 @@ impl Policy {
                 | BootRequest::Renewal(_),
             ) => before,
             Some(_) => 0,
-            None if is_crash => {
+            None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower)
+                || self.pin_resets_are_crashes && cause == Pin =>
+            {
                 // A device that resets for ever does not wear its flash out.
                 before.saturating_add(1).min(self.max_crash_resets.max(MOST_CRASHES))
             }
