@@ -183,7 +183,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_has_each_rule_of_the_chip() {
+    fn each_rule_of_the_chip_applies_and_is_on_the_page() {
         let page = files::ours("docs/emulator.md").unwrap();
         let patches = files::within(&workspace::root().join("tests/mutants-silicon")).unwrap();
         for patch in &patches {
@@ -194,6 +194,9 @@ mod tests {
             let without = without.strip_prefix("Without: ").expect("the third line");
             let row = format!("| {name} | {rule} | {source} | {without} |\n");
             assert!(page.contains(&row), "docs/emulator.md does not have this row:\n{row}");
+            let mut git = Command::new("git");
+            git.current_dir(workspace::root()).args(["apply", "--check"]).arg(patch);
+            process::run(&mut git).expect("it applies to the firmware as it is");
         }
         assert!(patches.len() >= 25);
     }
