@@ -19,6 +19,7 @@
 //! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
 //! | [`boot_report`] | information from the resident part of the bootloader to its RAM image |
 //! | [`services`] | the services of the resident part for the RAM image |
+//! | [`journal`] | the slots of the journal, its keys, and the record of a program |
 //! | [`renewal`] | a new RAM image: staged, on trial, confirmed, installed |
 //! | `reentry` | the return from an application to its bootloader (on the target) |
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
@@ -53,7 +54,7 @@
 //! | [`ram_image`] | build → resident part, RAM image | 64 | 1 word | refused | an [ability](abilities::Abilities) is refused |
 //! | [`nameplate`] | production → resident part, application | 32 | 2 words | – | – |
 //! | [`label`] | application → bootloader, tools | 32 | 2 words | – | – |
-//! | journal (`boot_core::store`) | resident part, RAM image → the same | 28 each | keys | – | a key is kept; a release or a state is none |
+//! | [`journal`] | resident part, RAM image, production → the two parts | 28 each | keys | – | a key is kept; a release or a state is none |
 //! | key block (`seal::key_block`) | production → bootloader | 256 | flags, 56 bytes | – | a flag is ignored |
 //!
 //! The header of an image has the CRC of the facts that it is for: one more ability, or field, makes
@@ -73,6 +74,7 @@ pub mod clock_tree;
 pub mod date;
 pub mod geometry;
 pub mod handoff;
+pub mod journal;
 pub mod label;
 pub mod layout;
 pub mod memory_map;

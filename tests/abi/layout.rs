@@ -7,8 +7,7 @@ use std::task::Poll;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::{run, Flash, FlashFault, Operation};
-use boot_core::store::record::Seal;
-use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Seal, Value};
 use coboot_app::callgate::Callgate;
 use seal::key_block::{find, COUNTER, EPOCH, FLAGS, FOR_TESTS, KEKS, KEK_COUNT, KEY, ROOTS, ROOT_COUNT};
 use shared_abi::abilities::Abilities;
@@ -177,7 +176,7 @@ fn of_journal(header: &[u8], record: &[u8]) -> String {
     match key.0 {
         0x1_00FF => format!("{:?}", RenewalRecord::from_value(value)),
         0x1_0001..=0x1_00FE => {
-            format!("{:?}", (ProgramRecord::from_value(value), ProgramRecord::partial_of(value).words()))
+            format!("{:?}", (ProgramRecord::from_value(value), ProgramRecord::partial_of(value)))
         }
         0x3_0000 => {
             let board = NodeParameters { id: NodeId::new(1), bit_rate: BitRate::K10 };

@@ -99,7 +99,7 @@ impl Device {
 
     /// The record of a program.
     pub fn record(&self, program: u8) -> Option<ProgramRecord> {
-        ProgramRecord::load(&self.parameters(), &self.chip, program)
+        self.parameters().program(&self.chip, program)
     }
 
     /// The lowest counter stored for a program.

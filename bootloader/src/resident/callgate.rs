@@ -14,8 +14,7 @@ use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::crash_count;
 use boot_core::flash::Flash;
 use boot_core::renewal::{check, header, identification, Places};
-use boot_core::store::record::Seal;
-use boot_core::store::{Key, NodeParameters, Parameters as _, ProgramRecord, RenewalRecord, Value};
+use boot_core::store::{Key, NodeParameters, Parameters as _, ProgramRecord, RenewalRecord, Seal, Value};
 use bsp::{pac, LAYOUT};
 use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
@@ -93,7 +92,7 @@ fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
     }
     // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
     let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
-    let record = ProgramRecord::load(parameters, flash, program);
+    let record = parameters.program(flash, program);
     record.is_some_and(|record| record.seal == Some(Seal::Locked))
 }
 
@@ -178,7 +177,7 @@ fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs
     }
     LAYOUT.program(number).ok_or(Status::BadArgument)?;
     let mut parameters = product::parameters(flash);
-    let record = ProgramRecord::load(&parameters, flash, number);
+    let record = parameters.program(flash, number);
     if selector == Selector::ProgramInfo {
         *args = ProgramArgs { number: args.number, ..ProgramArgs::default() };
         if let Some(record) = record {

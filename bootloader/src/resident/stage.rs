@@ -12,7 +12,7 @@ use boot_core::canopen::program::Supply;
 use boot_core::canopen::BitRate;
 use boot_core::decision::{choose, Exit, Images, PinReset, Start, Store, Woken};
 use boot_core::renewal::Places;
-use boot_core::store::{Key, ProgramRecord};
+use boot_core::store::{Key, Parameters as _};
 use bsp::clock::Source;
 use bsp::{functions, pac, LAYOUT};
 use cortex_m::peripheral::scb::VectActive;
@@ -300,9 +300,9 @@ unsafe fn enter_program(
 /// The date of a program, for the handoff; 0 if it is not known, or the product has no dates.
 fn date(start: &Start, parameters: &Parameters, flash: &ResidentFlash) -> u32 {
     let number = start.number;
-    let record = || Some((ProgramRecord::load(parameters, flash, number)?, LAYOUT.program(number)?));
+    let record = || Some((parameters.program(flash, number)?, LAYOUT.program(number)?));
     match PRODUCT.download.program_date.then(record).flatten() {
-        Some((record, region)) => record.date(parameters, flash, number, region),
+        Some((record, region)) => parameters.date(flash, number, region, &record),
         None => 0,
     }
 }

@@ -6,7 +6,7 @@ use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 
 use crate::flash::Flash;
-use crate::store::{Key, Parameters, ProgramRecord};
+use crate::store::{Key, Parameters};
 
 /// A proof that the code for sealed images is linked. Without the feature `sealed` this type has no value:
 /// then the compiler leaves out all code that needs one. No other line depends on the feature.
@@ -114,7 +114,7 @@ pub(crate) fn floor<F: Flash>(
         // It counts by itself.
         return (counter, epoch);
     }
-    if ProgramRecord::load(parameters, flash, program).is_some_and(|record| record.confirmed) {
+    if parameters.program(flash, program).is_some_and(|record| record.confirmed) {
         counter = counter.max(installed);
     }
     (counter.max(word(COUNTER)).max(lowest), epoch)

@@ -7,8 +7,7 @@ use shared_abi::vectors::{VectorFault, VectorTable};
 use crate::crc::CrcKind;
 use crate::flash::{fold, Flash};
 use crate::keys::is_sealed;
-use crate::store::record::Seal;
-use crate::store::{Parameters, ProgramRecord};
+use crate::store::{Parameters, ProgramRecord, Seal};
 
 /// A CRC over flash, computed in steps of limited length.
 #[derive(Clone, Copy, Debug)]
@@ -106,7 +105,7 @@ pub fn verify<F: Flash>(
     number: u8,
 ) -> Result<VerifiedProgram, Invalid> {
     let region = layout.program(number).ok_or(Invalid::NoSuchProgram)?;
-    let record = ProgramRecord::load(parameters, flash, number).ok_or(Invalid::Absent)?;
+    let record = parameters.program(flash, number).ok_or(Invalid::Absent)?;
     if !record.is_sealed() && is_sealed(flash, parameters, layout) {
         return Err(Invalid::Absent);
     }

@@ -17,7 +17,7 @@ use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
 use boot_core::decision::{self, choose, Exit, Images, Policy, Store, Woken};
 use boot_core::flash::{run, Flash as _};
-use boot_core::store::{Journal, Key, NodeParameters, Parameters as _, ProgramRecord};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters as _};
 use coboot_app::{Defaults, Next, Start};
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
@@ -342,7 +342,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
 
 /// The bytes of a program, as they were downloaded.
 fn contents(flash: &FileFlash, journal: &Journal, config: &bootloader::Config, number: u8) -> Vec<u8> {
-    let record = ProgramRecord::load(journal, flash, number);
+    let record = journal.program(flash, number);
     let (Some(record), Some(region)) = (record, config.layout.program(number)) else { return Vec::new() };
     let mut bytes = vec![0; record.size.min(region.size) as usize];
     flash.read(region.base, &mut bytes);

@@ -48,7 +48,7 @@ struct Underneath {
 impl Underneath {
     /// What is known of a program.
     fn record(&self, program: u8) -> Option<ProgramRecord> {
-        ProgramRecord::load(&Journal::open(&self.flash, self.layout.parameters), &self.flash, program)
+        Journal::open(&self.flash, self.layout.parameters).program(&self.flash, program)
     }
 }
 

@@ -382,7 +382,7 @@ impl Device for Model {
         let journal = Store::open(&flash, layout, self.mistake);
         let record = RenewalRecord::load(&journal, &flash);
         let programs = (1..=setup.programs()).map(|number| {
-            let record = ProgramRecord::load(&journal, &flash, number);
+            let record = journal.program(&flash, number);
             let region = setup.region(number);
             let stored = record.map_or(Stored::None, |record| {
                 let place = Region::new(region.base, record.size.min(region.size));
@@ -419,7 +419,7 @@ impl Device for Model {
                     record.signed && crc32(&flash.cells(region)[..record.size as usize]) == record.crc
                 };
                 // A bit between 0 and 1 may hide the record that the boot stage has read.
-                let mut records = (0..64).map(|_| ProgramRecord::load(&journal, &flash, start.number));
+                let mut records = (0..64).map(|_| journal.program(&flash, start.number));
                 Some((start.number, records.any(|record| record.is_some_and(is_whole))))
             }
             Exit::Bootloader { .. } | Exit::Again | Exit::Choose => None,

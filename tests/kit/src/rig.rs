@@ -471,7 +471,7 @@ impl Rig {
             if program > self.setup.programs() {
                 return None;
             }
-            let record = ProgramRecord::load(&parameters, &flash, program)?;
+            let record = parameters.program(&flash, program)?;
             Some((record.size, record.crc, record.signed, record.version))
         };
         Stored {

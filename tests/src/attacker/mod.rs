@@ -617,7 +617,7 @@ impl Attack {
         for (program, region) in (1..).zip(layout.programs) {
             let at = usize::from(program) - 1;
             let was = self.records[at];
-            let record = ProgramRecord::load(&journal, &view, program);
+            let record = journal.program(&view, program);
             let asked: Vec<Ask> = self.model.asked(program).collect();
             let may_change = asked
                 .iter()

@@ -7,7 +7,7 @@ use emulator::machine::{Cells, ResetCause, Stop};
 use shared_abi::geometry::Region;
 
 use boot_core::crc32;
-use boot_core::store::{Journal, ProgramRecord};
+use boot_core::store::{Journal, Parameters as _};
 
 use super::story::{program_flash, Observation, Outcome, Story, BOOT_MS};
 use crate::bench::Bench;
@@ -104,7 +104,7 @@ fn records_are_true(cells: &Cells) -> Result<(), String> {
     flash.poke(board.chip.flash.base, &cells.bytes);
     let journal = Journal::open(&flash, board.parameters);
     for (number, region) in (1..).zip(board.programs) {
-        let Some(record) = ProgramRecord::load(&journal, &flash, number) else { continue };
+        let Some(record) = journal.program(&flash, number) else { continue };
         let program = Region::new(region.base, record.size.min(region.size));
         let from = program.base - board.chip.flash.base;
         let between = cells.unstable.range(from..from + program.size).next();

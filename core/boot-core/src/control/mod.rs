@@ -609,7 +609,7 @@ fn load<C: Choices>(
     let value = parameters.get(flash, Key::program(number)).unwrap_or([0; 4]);
     let record = ProgramRecord::from_value(value);
     let record = record.filter(|record| record.is_sealed() || !rights.takes_no_other());
-    (record, if C::RESUMES { ProgramRecord::partial_of(value) } else { Partial::NONE })
+    (record, if C::RESUMES { Partial::of_words(ProgramRecord::partial_of(value)) } else { Partial::NONE })
 }
 
 /// The creation date of a program with this record, in seconds since 1970-01-01 UTC; 0 if unknown.
@@ -621,7 +621,7 @@ fn date<C: Choices>(
     record: Option<ProgramRecord>,
 ) -> u32 {
     match record {
-        Some(record) if C::DATES => record.date(parameters, flash, number, region),
+        Some(record) if C::DATES => parameters.date(flash, number, region, &record),
         _ => 0,
     }
 }

@@ -875,14 +875,15 @@ impl<'b, C: Choices> Programmer<'b, C> {
                 return Ok(Some(store_counter(parameters, program, counter)));
             }
         }
-        let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+        let stored = parameters.get(flash, Key::program(program));
+        let mut half_erased = stored.is_some_and(ProgramRecord::is_half_erased);
         let mut partial = Partial::NONE;
         if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
             // From the second time on, the stored value is that of the present work.
             target.half_erased &= core::mem::replace(&mut half_erased, true);
             partial = target.partial;
         }
-        let value = ProgramRecord::none(half_erased, partial);
+        let value = ProgramRecord::none(half_erased, partial.words());
         Ok(Some(store(parameters, Change::Void, program, value)))
     }
 
@@ -937,7 +938,7 @@ impl Target {
             return None;
         }
         (self.clearing, self.half_erased) = (false, false);
-        let value = ProgramRecord::none(false, Partial::NONE);
+        let value = ProgramRecord::none(false, [0; 2]);
         (!self.opened).then(|| store(parameters, Change::Clear, self.program, value))
     }
 

@@ -22,27 +22,13 @@
 //! that ([`Parameters::compact`]).
 
 use shared_abi::geometry::Region;
+use shared_abi::journal::{self, first_slot, Key, Slot, Value, FORMAT, HEADER_MAGIC, MARK_WORD, SLOT_SIZE};
 
-use super::parameters::{Key, Parameters, StoreError, Value};
-use crate::crc;
+use super::parameters::{Parameters, StoreError};
+use crate::crc::crc32;
 use crate::flash::{Flash, FlashFault, Next, Operation, ERASED};
 use crate::sequence::{EraseSectors, ProgramWords};
 
-/// A tag, the four words of a value, a CRC, and the mark.
-const SLOT_WORDS: usize = 7;
-/// The place of the mark in a slot; in front of it are the words that a reader needs.
-const MARK_WORD: usize = 6;
-/// The mark.
-const MARK: u32 = 0;
-const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
-type Slot = [u32; SLOT_WORDS];
-
-/// Identifies a region's header ("CBNV" read as little-endian bytes).
-const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
-/// Version of the journal's format: the meaning of the keys' values. A journal of an older version
-/// is read, and converted to this one when the next value is stored. A journal of a newer version
-/// belongs to a newer bootloader and is not changed.
-const FORMAT: u32 = 1;
 /// How many times a store tries a further slot or region before it gives up.
 const ATTEMPTS: u8 = 8;
 /// With fewer free slots than these a region [is nearly full](Parameters::is_nearly_full). (A region of a
@@ -230,7 +216,7 @@ impl Journal {
                 (Err(fault), _) => Err(fault),
                 (_, Step::Idle | Step::Begin) => Ok(None),
                 (_, Step::Erase) => self.storing.sectors.next(flash),
-                _ => self.storing.words.next(flash, SLOT_WORDS, |i| self.storing.slot[i]),
+                _ => self.storing.words.next(flash, self.storing.slot.len(), |i| self.storing.slot[i]),
             };
             outcome = Ok(());
             // Without its mark a slot is as good for a reader.
@@ -398,7 +384,7 @@ impl Journal {
 
 /// The words at an address.
 fn read_slot<F: Flash>(flash: &F, at: u32) -> Slot {
-    let mut found = [0; SLOT_WORDS];
+    let mut found = Slot::default();
     for (word, address) in found.iter_mut().zip((at..).step_by(4)) {
         *word = flash.read_word(address);
     }
@@ -422,15 +408,10 @@ fn sound_slot<F: Flash>(flash: &F, at: u32) -> Option<Slot> {
     (found[..MARK_WORD] == sound[..MARK_WORD]).then_some(sound)
 }
 
-const fn first_slot(region: &Region) -> u32 {
-    region.base + SLOT_SIZE
-}
-
-fn slot(tag: u32, [a, b, c, d]: Value) -> Slot {
-    let check = [tag, a, b, c, d].iter().fold(0, |crc, word| crc::resume(crc, &word.to_le_bytes()));
-    [tag, a, b, c, d, check, MARK]
+fn slot(tag: u32, value: Value) -> Slot {
+    journal::slot(tag, value, crc32)
 }
 
 fn header_slot(sequence: u32) -> Slot {
-    slot(HEADER_MAGIC, [sequence, !sequence, FORMAT, ERASED])
+    journal::header_slot(sequence, crc32)
 }

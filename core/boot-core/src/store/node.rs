@@ -2,8 +2,9 @@
 
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
+use shared_abi::journal;
 
-use super::parameters::{Key, Parameters, Value};
+use super::{Key, Parameters, Value};
 use crate::flash::Flash;
 
 /// The node-ID and the bit rate of a device.
@@ -45,7 +46,7 @@ impl NodeParameters {
     /// The stored form.
     #[must_use]
     pub fn value(&self) -> Value {
-        [self.id_or_none().into(), self.bit_rate as u32, 0, 0]
+        journal::node(self.id_or_none(), self.bit_rate as u8)
     }
 
     /// The node-ID; 255 for none.

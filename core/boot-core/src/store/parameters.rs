@@ -1,54 +1,11 @@
-//! What is stored: values under keys.
+//! Where it is stored: values under keys.
 
+use shared_abi::geometry::Region;
+use shared_abi::journal::{Key, ProgramRecord, Value};
+use shared_abi::label::{self, Label};
 use shared_abi::ram_image::SERVICES_VERSION;
 
 use crate::flash::{Flash, FlashFault, Next};
-
-/// The key of a stored value: a word, in flash and between the parts of the bootloader. A part that
-/// does not know a key keeps its value. FFFFFFFFh (erased flash) is no key; 0008xxxxh and 0009xxxxh are
-/// kept (`shared_abi`).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(transparent)]
-pub struct Key(pub u32);
-
-impl Key {
-    /// The number of consecutive times that the application ended without a request.
-    pub const CRASH_COUNT: Self = Self(0x0002_0000);
-    /// Node-ID and bit rate, see [`NodeParameters`](super::NodeParameters).
-    pub const NODE: Self = Self(0x0003_0000);
-    /// The number of grants of rights, and whether one of them has opened the device permanently.
-    pub const GRANTS: Self = Self(0x0006_0000);
-
-    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord); 255 is that of
-    /// the bootloader's RAM image, see [`RenewalRecord`](super::RenewalRecord).
-    #[must_use]
-    pub const fn program(number: u8) -> Self {
-        Self(0x0001_0000 | number as u32)
-    }
-
-    /// Of a program (1 to 254, 255 for the bootloader): the lowest security counter and the lowest epoch
-    /// that the device accepts, and the counter of the installed program. This value survives the program's record.
-    #[must_use]
-    pub const fn counter(number: u8) -> Self {
-        Self(0x0004_0000 | number as u32)
-    }
-
-    /// The creation date of a program (1 to 254), and the CRC of the program to which it belongs, see
-    /// [`ProgramRecord::date`](super::ProgramRecord::date).
-    #[must_use]
-    pub const fn date(number: u8) -> Self {
-        Self(0x0007_0000 | number as u32)
-    }
-
-    /// An event (0 to 7), see `seal::access`.
-    #[must_use]
-    pub const fn event(place: u8) -> Self {
-        Self(0x0005_0000 | place as u32)
-    }
-}
-
-/// The words of a value; their meaning depends on the key.
-pub type Value = [u32; 4];
 
 /// Why a value could not be stored. 1F57h then shows NVDATA.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -85,6 +42,24 @@ pub trait Parameters {
 
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
+
+    /// The record of a program; `None` if there is no program.
+    fn program<F: Flash>(&self, flash: &F, number: u8) -> Option<ProgramRecord> {
+        ProgramRecord::from_value(self.get(flash, Key::program(number))?)
+    }
+
+    /// The creation date of a program in seconds since 1970-01-01 UTC: the one that came with it
+    /// ([`Key::date`]), or the one in its label; 0 if neither is known.
+    fn date<F: Flash>(&self, flash: &F, number: u8, region: Region, record: &ProgramRecord) -> u32 {
+        match self.get(flash, Key::date(number)) {
+            Some([date, crc, ..]) if crc == record.crc => return date,
+            _ if record.size < label::OFFSET + label::SIZE as u32 => return 0,
+            _ => {}
+        }
+        let mut bytes = [0; label::SIZE];
+        flash.read(region.base + label::OFFSET, &mut bytes);
+        Label::parse(&bytes).map_or(0, |label| label.date)
+    }
 
     /// Starts to store one value; [`next`](Self::next) carries it out. After a success the value is
     /// certain, also if a power cut had left it between 0 and 1. During a compaction it follows after it.

@@ -2,7 +2,7 @@
 
 use shared_abi::renewal::{State, BOOTLOADER};
 
-use super::parameters::{Key, Parameters, Value};
+use super::{Key, Parameters, Value};
 use crate::flash::Flash;
 
 /// The stored record of a complete RAM image in staging. It is removed before the flash of staging

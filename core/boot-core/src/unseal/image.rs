@@ -16,7 +16,7 @@ use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
 use crate::queue::{Piece, Queue};
 use crate::renewal::header;
-use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord, Value};
+use crate::store::{Key, Parameters, RenewalRecord, Value};
 
 // `seal` depends on nothing, so it has the number, too.
 const _: () = assert!(seal::wire::BOOTLOADER == BOOTLOADER);
@@ -261,7 +261,7 @@ impl Place {
         flash: &F,
         parameters: &impl Parameters,
     ) -> Option<Same> {
-        let record = ProgramRecord::load(parameters, flash, self.program)?;
+        let record = parameters.program(flash, self.program)?;
         let [_, _, installed, _] = parameters.get(flash, Key::counter(self.program)).unwrap_or([0; 4]);
         let is_same = record.seal.is_some()
             && (record.size, record.crc, record.version) == (head.size(), head.crc(), head.version())
@@ -300,7 +300,7 @@ impl Place {
         }
         let other = 3_u8.wrapping_sub(self.program);
         let place = self.layout.program(other);
-        let record = ProgramRecord::load(parameters, flash, other);
+        let record = parameters.program(flash, other);
         let (Some(place), Some(record)) = (place, record) else { return Err(Fault::WrongProduct) };
         Ok(Some(Region::new(place.base, record.size.min(place.size))))
     }
@@ -348,7 +348,7 @@ pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program:
         // Its counter is raised with the confirmation, and by nothing else.
         return None;
     }
-    let record = ProgramRecord::load(parameters, flash, program)?;
+    let record = parameters.program(flash, program)?;
     let [counter, epoch, installed, _] = parameters.get(flash, Key::counter(program))?;
     (record.confirmed && installed >= counter).then_some([installed, epoch, installed, 0])
 }

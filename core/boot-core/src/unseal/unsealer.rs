@@ -10,7 +10,7 @@ use crate::flash::Flash;
 use crate::keys::OfSealed;
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
-use crate::store::record::Seal;
+use crate::store::Seal;
 use crate::store::{Parameters, ProgramRecord, Value};
 
 /// The processing of a sealed image, in a device that takes them.

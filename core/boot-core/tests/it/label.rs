@@ -3,7 +3,7 @@
 //! one.
 
 use boot_core::control::{AppInfo, Policy, Verdict};
-use boot_core::store::{Journal, ProgramRecord};
+use boot_core::store::{Journal, Parameters as _};
 use canopen::od::{Address, Objects};
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -113,7 +113,7 @@ fn a_label_that_fits_is_taken_and_tells_the_version() {
             block_file(&image, chunk)[1..].iter().for_each(|block| bench.good(block));
             assert_eq!(bench.command(SET_SIGNATURE), 0);
             let journal = Journal::open(&flash, LAYOUT.parameters);
-            assert_eq!(ProgramRecord::load(&journal, &flash, 1).unwrap().version, version);
+            assert_eq!(journal.program(&flash, 1).unwrap().version, version);
             assert_eq!(autostart(&flash), Ok(NEW));
         }
     }

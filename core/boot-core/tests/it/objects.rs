@@ -762,7 +762,7 @@ fn an_idle_device_stays_idle() {
 /// The stored record of program 1.
 fn record(bench: &mut Bench<'_>) -> Option<ProgramRecord> {
     let flash = bench.node.flash();
-    ProgramRecord::load(&Journal::open(flash, kit::bench::LAYOUT.parameters), flash, 1)
+    Journal::open(flash, kit::bench::LAYOUT.parameters).program(flash, 1)
 }
 
 /// Only the confirmation marks a program that has returned the device; it is stored once.

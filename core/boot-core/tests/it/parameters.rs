@@ -621,7 +621,7 @@ fn an_idle_bootloader_compacts_its_journal_and_takes_commands_meanwhile() {
         assert_eq!(erased, usize::from(compacts), "{used} used slots, {at_ms} ms");
         let journal = Journal::open(&flash, JOURNAL);
         assert_eq!(journal.get(&flash, Key::CRASH_COUNT), Some([used - 1, 0, 0, 0]));
-        let record = ProgramRecord::load(&journal, &flash, 1).unwrap();
+        let record = journal.program(&flash, 1).unwrap();
         assert_eq!(record.signed, !compacts, "{used} used slots, {at_ms} ms");
     }
 }
@@ -674,7 +674,7 @@ fn a_value_that_comes_during_a_compaction_which_fails_is_stored() {
         assert!(bench.node.is_compacting());
         let room = used < 585;
         assert_eq!(bench.command(CLR_SIGNATURE) == 0, room, "{used} used slots");
-        assert_eq!(ProgramRecord::load(&Journal::open(&flash, JOURNAL), &flash, 1).unwrap().signed, !room);
+        assert_eq!(Journal::open(&flash, JOURNAL).program(&flash, 1).unwrap().signed, !room);
     }
 }
 
@@ -847,7 +847,7 @@ fn the_record_of_a_program_has_its_words() {
 /// record, it is not released.
 #[test]
 fn a_withdrawn_program_is_not_released_by_its_flags() {
-    use boot_core::store::record::Seal;
+    use boot_core::store::Seal;
 
     let seal = Some(Seal::Locked);
     let record = ProgramRecord { confirmed: true, version: 7, seal, ..released(0x1234, 1) };

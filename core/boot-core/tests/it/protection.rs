@@ -2,7 +2,7 @@
 //! not given up.
 
 use boot_core::flash::is_write_protected;
-use boot_core::store::{Journal, ProgramRecord};
+use boot_core::store::{Journal, Parameters as _};
 use canopen::AbortCode;
 use kit::bench::CLEAR;
 use kit::rig::{
@@ -110,7 +110,7 @@ fn blocks_are_refused_before_the_record_is_removed() {
         assert_eq!(rig.status(1), secured(sector));
         assert!(rig.send(1, &block(2, base + 1000, &new[1000..])).is_err());
         let journal = Journal::open(&rig.chip, STANDARD_1.layout.parameters);
-        let record = ProgramRecord::load(&journal, &rig.chip, 1).expect("the record stays");
+        let record = journal.program(&rig.chip, 1).expect("the record stays");
         assert_eq!(record.size, 900);
         assert_stays(&mut rig, &old, "after a block");
     }

@@ -36,7 +36,7 @@ use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 use std::{fs, thread};
 
-use boot_core::store::{Journal, ProgramRecord};
+use boot_core::store::{Journal, Parameters as _, ProgramRecord};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coflash_agent::Config;
 use coflash_core::file::board;
@@ -360,7 +360,7 @@ impl Bench {
             let layout = self.row.layout();
             let flash = FileFlash::open(&self.folder.path(&name), layout, Speed::Instant).unwrap();
             let journal = Journal::open(&flash, layout.parameters);
-            Has { bytes, record: ProgramRecord::load(&journal, &flash, self.row.program()) }
+            Has { bytes, record: journal.program(&flash, self.row.program()) }
         };
         self.serials().into_iter().map(of).collect()
     }
