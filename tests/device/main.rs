@@ -10,6 +10,7 @@ mod crystal;
 #[cfg(split_map)]
 mod debugger;
 mod device;
+mod factory;
 mod handover;
 mod hostile_bus;
 mod image;

@@ -9,6 +9,7 @@ mod confirmation;
 mod conform;
 mod device;
 mod dictionary;
+mod factory;
 mod flash_lock;
 mod model;
 mod pieces;

@@ -6,6 +6,7 @@ pub mod call_back;
 pub mod dead_crystal;
 pub mod eds;
 pub mod endpoint;
+pub mod factory;
 pub mod firmware;
 pub mod fleet;
 pub mod listener;

@@ -68,6 +68,8 @@ seal keys show release.cert
 seal provision bootloader-sealed.elf --board stm32f407g-disc1 --root root.pub -o production.hex
 seal nameplate plate.hex --vendor 0x123 --product 0x5EA10007 --revision 0x00020003 --lock
 seal nameplate plate.hex --vendor 0x123 --product 0x5EA10007 --revision 0x00020004 --block 1
+seal factory bootloader.elf app.elf --board stm32f407g-disc1 -o factory.hex
+seal factory production.hex app.cbs --board stm32f407g-disc1 -o factory.elf --option-bytes options.txt --brown-out 3
 seal image app.elf --board stm32f407g-disc1 --key release.pem --cert release.cert --counter 1
 seal image app.elf --key release.pem --cert release.cert --counter 1 --compress --encrypt kek.pem
 seal image app.elf --board stm32f407g-disc1 --key release.pem --cert release.cert --counter 1 --blocks

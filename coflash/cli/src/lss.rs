@@ -315,7 +315,7 @@ fn value(address: &LssAddress) -> Value {
     })
 }
 
-fn bit_rate(text: &str) -> Result<BitRate, String> {
+pub(super) fn bit_rate(text: &str) -> Result<BitRate, String> {
     let rate = number(text)?.checked_mul(1000);
     (0..=8)
         .filter_map(BitRate::from_index)

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use canopen::program::ProgramControl;
-use canopen::BitRate;
+use canopen::{BitRate, NodeId};
 use coflash_core::device::Dialect;
 use coflash_core::file::sealed::{SealedFile, Sealer};
 use coflash_core::file::Program;
@@ -12,7 +12,7 @@ use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
 use crate::bench::{Bench, NODE, RESCUE_WINDOW_MS};
-use crate::{firmware, renewal, sealed_board};
+use crate::{factory, firmware, renewal, sealed_board};
 
 /// A board with a program, confirmed or not, runs it within this time, in ms.
 pub const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
@@ -163,6 +163,12 @@ pub(super) const SCENARIOS: &[Scenario] = &[
         prepare: resume,
     },
     Scenario {
+        name: "factory",
+        about: "version 2 in blocks is the first update after version 1 of the production line",
+        is_sealed: false,
+        prepare: factory,
+    },
+    Scenario {
         name: "confirm",
         about: "version 2 runs and was never confirmed; it is called back, and started again",
         is_sealed: false,
@@ -276,6 +282,16 @@ fn resume() -> Result<Story, String> {
     story.start = bench.machine().flash_cells();
     story.from.outcome = Outcome::Bootloader;
     Ok(story)
+}
+
+/// Version 1 has never been confirmed, and the journal has the records of the production line alone.
+fn factory() -> Result<Story, String> {
+    let boot = factory::bootloader(firmware::BOOTLOADER);
+    let id = NodeId::new(NODE).ok_or("no node-ID")?;
+    let boot = boot.with_node(id, RATE).map_err(|fault| fault.to_string())?;
+    let mut bench = factory::board(&boot.join(&factory::first(&boot, firmware::APP_V1)));
+    let start = bench.machine().flash_cells();
+    Ok(Story { start, ..update(|bench| write(bench, &options()))? })
 }
 
 fn confirm() -> Result<Story, String> {

@@ -1,6 +1,7 @@
 //! `coflash seal`: keys, sealed images, and devices that accept nothing else.
 
 pub(crate) mod access;
+pub(crate) mod factory;
 pub(crate) mod image;
 pub(crate) mod keys;
 pub(crate) mod nameplate;
@@ -23,6 +24,7 @@ pub(crate) enum Seal {
     VerifyDevice(verify_device::VerifyDevice),
     Provision(provision::Provision),
     Nameplate(nameplate::MakeNameplate),
+    Factory(Box<factory::Factory>),
     Unlock(access::Unlock),
     Events(access::Events),
 }
@@ -42,6 +44,7 @@ impl Seal {
             Self::VerifyDevice(verify) => verify.run(context),
             Self::Provision(provision) => provision.run(context),
             Self::Nameplate(nameplate) => nameplate.run(context),
+            Self::Factory(factory) => factory.run(context),
             Self::Unlock(unlock) => unlock.run(context),
             Self::Events(events) => events.run(context),
         }

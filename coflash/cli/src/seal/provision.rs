@@ -1,14 +1,15 @@
 //! `coflash seal provision`: writes keys into a bootloader, for production.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use coflash_core::device::option_bytes::sector_list;
-use coflash_core::file::ihex;
 use coflash_core::file::read::{self, Firmware, Format};
 use coflash_core::file::sealed::provision::{protected_sectors, provision};
 use coflash_core::file::sealed::{key_block, Kek, PublicKey};
+use coflash_core::file::{ihex, Image};
 use serde_json::json;
+use shared_abi::layout::Layout;
 
 use crate::context::Context;
 use crate::file::{Input, MemoryMap};
@@ -61,12 +62,7 @@ impl Provision {
             let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
-        let bytes = crate::file::bytes(path)?;
-        let format = Format::detect(&bytes).or(Some(Format::Raw));
-        let firmware = read::read(&bytes, format, Some(layout.bootloader.base));
-        let Firmware::Image(image) = firmware.map_err(|error| error.of(path.display()))? else {
-            return Err(Failure::file(path, "is a block file, not a bootloader: give the linker's output"));
-        };
+        let image = bootloader(path, layout)?;
         let (roots, keks) = self.keys.keys()?;
         let KeyBlock { counter, epoch, for_tests, .. } = self.keys;
         let block = key_block(&roots, &keks, counter, epoch, for_tests)
@@ -110,5 +106,19 @@ impl Provision {
             })
         });
         Ok(())
+    }
+}
+
+/// The bootloader in a file.
+pub(super) fn bootloader(path: &Path, layout: &Layout) -> Result<Image, Failure> {
+    let bytes = crate::file::bytes(path)?;
+    let format = Format::detect(&bytes).or(Some(Format::Raw));
+    match read::read(&bytes, format, Some(layout.bootloader.base))
+        .map_err(|error| error.of(path.display()))?
+    {
+        Firmware::Image(image) => Ok(image),
+        Firmware::Blocks(_) => {
+            Err(Failure::file(path, "is a block file, not a bootloader: give the linker's output"))
+        }
     }
 }

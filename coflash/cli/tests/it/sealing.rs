@@ -574,6 +574,28 @@ fn a_bootloader_gets_its_keys() {
     coflash(&["seal", "provision", &boot, "--root", &root]).fails(2, &["give --board"]);
 }
 
+/// What only the command line knows; `tests/device/factory.rs` and `tests/sealed/factory.rs` have built bootloaders.
+#[test]
+fn a_file_for_production_has_a_format_and_takes_nobodys_place() {
+    let room = Room::new("factory");
+    let boot = room.0.file("boot.hex", bootloader(b"CBS1").as_bytes());
+    let (app, out) = (room.path("app.hex"), room.path("factory.hex"));
+    let factory = |more: &[&str]| coflash(&[&["seal", "factory", &boot, &app][..], more].concat());
+    let board = ["--board", "stm32f407g-disc1"];
+    factory(&["-o", &out]).fails(2, &["give --board"]);
+    for (more, exit, words) in [
+        (&["-o", &room.path("factory.txt")][..], 2, "name the file with .hex, .elf or .bin"),
+        (&["-o", &room.path("factory.bin"), "--nameplate", &app], 2, "no place for a nameplate"),
+        (&["-o", &boot], 2, "the result would overwrite"),
+        (&["-o", &out, "--option-bytes", &room.path("options.txt")], 2, "--brown-out"),
+        (&["-o", &out, "--node-id", "5"], 2, "--bit-rate"),
+        (&["-o", &out], 3, "not a coboot bootloader"),
+    ] {
+        factory(&[&board[..], more].concat()).fails(exit, &[words]);
+    }
+    assert!(!Path::new(&out).exists());
+}
+
 /// The library's own check of the results of the commands.
 #[test]
 fn the_commands_make_what_the_library_verifies() {

@@ -9,6 +9,43 @@ use serde::{Serialize, Serializer};
 pub struct OptionBytes(pub u32);
 
 impl OptionBytes {
+    /// Those of a chip from the factory (RM0090 section 3.9.10), with this level of the brown-out reset, 1 to 3, and
+    /// with write protection of these sectors of the first bank: bit *n* for sector *n*.
+    #[must_use]
+    pub const fn of_product(brown_out_level: u32, protect: u32) -> Self {
+        Self(0x0FFF_AAED & !(brown_out_level << 2) & !(protect << 16))
+    }
+
+    /// A text for the production line: the commands that write them by three programmers. `chip` is the name for
+    /// probe-rs. OpenOCD and probe-rs do it by registers, as RM0090 section 3.6.2 has it.
+    #[must_use]
+    pub fn commands(self, chip: &str) -> String {
+        const OPTKEYR: u32 = 0x4002_3C08;
+        const OPTCR: u32 = 0x4002_3C14;
+        let Self(value) = self;
+        // With OPTLOCK (bit 0) cleared; OPTSTRT (bit 1) begins.
+        let words = [
+            (OPTKEYR, 0x0819_2A3B),
+            (OPTKEYR, 0x4C5D_6E7F),
+            (OPTCR, value & !0b11),
+            (OPTCR, value & !0b11 | 0b10),
+        ];
+        let protected =
+            (0..12).filter(|sector| self.protects(*sector)).map(|sector| format!(" nWRP{sector}=0"));
+        let openocd = words.map(|(at, word)| format!("mww {at:#010x} {word:#010x}; ")).concat();
+        let probe_rs =
+            words.map(|(at, word)| format!("probe-rs write --chip {chip} b32 {at:#010x} {word:#010x}\n"));
+        format!(
+            "# Option bytes: {self}\n# Once the flash is written and compared, by ONE of the three; then a power cycle. \
+             Read-out protection comes last, and by hand.\n\n# STM32CubeProgrammer\nSTM32_Programmer_CLI -c port=SWD \
+             -ob BOR_LEV={}{}\n\n# OpenOCD\nopenocd -f interface/stlink.cfg -f target/stm32f4x.cfg -c \"init; reset \
+             halt; {openocd}sleep 1000; reset run; exit\"\n\n# probe-rs\n{}",
+            value >> 2 & 0b11,
+            protected.collect::<String>(),
+            probe_rs.concat(),
+        )
+    }
+
     /// The level of the brown-out reset, 1 to 3; `None` if it is off.
     #[must_use]
     pub fn brown_out_level(self) -> Option<u8> {

@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use object::elf::{
-    FileHeader32, ProgramHeader32, SectionHeader32, EM_ARM, ET_CORE, ET_DYN, ET_EXEC, ET_REL, PT_LOAD,
-    SHF_ALLOC, SHT_NOBITS,
+    FileHeader32, ProgramHeader32, SectionHeader32, EM_ARM, ET_CORE, ET_DYN, ET_EXEC, ET_REL, PF_R, PF_X,
+    PT_LOAD, SHF_ALLOC, SHF_EXECINSTR, SHT_NOBITS, SHT_PROGBITS, SHT_STRTAB,
 };
 use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::Endianness;
@@ -89,6 +89,44 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         }
     }
     pieces.into_image()
+}
+
+/// An image as an ELF executable: a segment and a section for each contiguous range (System V ABI, chapters 4 and
+/// 5; section names `.flash`). `entry` is the address where a debugger starts.
+#[must_use]
+pub fn emit(image: &Image, entry: u32) -> Vec<u8> {
+    const HEADER: u32 = 52;
+    const NAMES: &[u8] = b"\0.flash\0.shstrtab\0\0\0";
+    const FLASH: u32 = 1;
+    const SHSTRTAB: u32 = 8;
+    let segments: Vec<_> = image.segments().collect();
+    let count = segments.len() as u32;
+    let from = HEADER + 32 * count;
+    let mut data = Vec::new();
+    let mut loads = Vec::new();
+    let mut sections = vec![[0; 10]];
+    for (address, bytes) in &segments {
+        let (offset, size) = (from + data.len() as u32, bytes.len() as u32);
+        loads.push([PT_LOAD, offset, *address, *address, size, size, PF_R | PF_X, 4]);
+        let flags = SHF_ALLOC | SHF_EXECINSTR;
+        sections.push([FLASH, SHT_PROGBITS, flags, *address, offset, size, 0, 0, 4, 0]);
+        data.extend_from_slice(bytes);
+        data.resize(data.len().next_multiple_of(4), 0xFF);
+    }
+    let names = from + data.len() as u32;
+    sections.push([SHSTRTAB, SHT_STRTAB, 0, 0, names, NAMES.len() as u32, 0, 0, 1, 0]);
+    data.extend_from_slice(NAMES);
+    let mut file = vec![0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+    file.extend([ET_EXEC, EM_ARM].into_iter().flat_map(u16::to_le_bytes));
+    // Version, entry, offsets of the two tables, and the flags of the EABI 5.
+    let words = [1, entry, HEADER, from + data.len() as u32, 0x0500_0000];
+    file.extend(words.into_iter().flat_map(u32::to_le_bytes));
+    let sizes = [HEADER, 32, count, 40, count + 2, count + 1];
+    file.extend(sizes.into_iter().flat_map(|size| (size as u16).to_le_bytes()));
+    file.extend(loads.into_iter().flatten().flat_map(u32::to_le_bytes));
+    file.extend(data);
+    file.extend(sections.into_iter().flatten().flat_map(u32::to_le_bytes));
+    file
 }
 
 /// The header of a linked program for the device.

@@ -145,6 +145,12 @@ impl Image {
         self.pieces.iter().map(|piece| (piece.address, &piece.data[..]))
     }
 
+    /// Its bytes from the first to the last one; the gaps are erased flash.
+    #[must_use]
+    pub fn filled(&self) -> Cow<'_, [u8]> {
+        self.flat(self.span().first, self.span().len() as u32)
+    }
+
     /// The memory from `start` on, `size` bytes of it; the gaps are erased flash.
     pub(crate) fn flat(&self, start: u32, size: u32) -> Cow<'_, [u8]> {
         match &self.pieces[..] {

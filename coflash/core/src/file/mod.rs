@@ -6,6 +6,7 @@ pub mod checksum;
 pub use coboot_linker::board;
 pub mod convert;
 pub mod elf;
+pub mod factory;
 pub mod fault;
 pub mod foreign;
 pub mod ihex;

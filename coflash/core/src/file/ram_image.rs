@@ -1,5 +1,6 @@
 //! The RAM image of a bootloader in a firmware file: what `coflash flash` renews a bootloader with.
 
+use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, MAGIC};
 
 use super::checksum::CRC;
@@ -72,6 +73,16 @@ impl RamImage {
             _ => Self::at(&data),
         })?;
         Some(Self { program: program_after(image, image.span().first), ..found })
+    }
+
+    /// The RAM image in the bootloader of a board: at its home, or after the resident part in the compact map.
+    pub(super) fn in_bootloader(image: &Image, layout: &Layout) -> Option<Self> {
+        let (place, places) = match layout.home {
+            Some(home) => (home, 1),
+            None => (layout.bootloader, layout.bootloader.size as usize / 4),
+        };
+        let bytes = image.flat(place.base, place.size);
+        (0..bytes.len()).step_by(4).take(places).find_map(|at| Self::at(&bytes[at..]))
     }
 
     /// The RAM image at the start of these bytes.

@@ -60,17 +60,8 @@ pub enum ProvisionFault {
 /// See [`ProvisionFault`].
 pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Result<Image, ProvisionFault> {
     let home = AddressRange::from(layout.home.ok_or(ProvisionFault::Compact)?);
+    check_place(bootloader, layout)?;
     let resident = AddressRange::from(layout.bootloader);
-    for (address, data) in bootloader.segments() {
-        let found = AddressRange { first: address, last: address.saturating_add(data.len() as u32 - 1) };
-        if !resident.contains(&found) && !home.contains(&found) {
-            return Err(ProvisionFault::Elsewhere { found, resident, home });
-        }
-    }
-    let found = bootloader.span();
-    if found.first != resident.first {
-        return Err(ProvisionFault::Start { found: found.first, start: resident.first });
-    }
     if bootloader.bytes(resident.first + MARK_OFFSET) != Some(KNOWS_SEALED_IMAGES.to_le_bytes()) {
         return Err(ProvisionFault::Open);
     }
@@ -101,6 +92,22 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     }
     pieces.add(place.first, block.to_vec(), Place::File);
     Ok(pieces.in_order())
+}
+
+/// Checks that an image lies where the bootloader of this board does.
+pub(in crate::file) fn check_place(bootloader: &Image, layout: &Layout) -> Result<(), ProvisionFault> {
+    let resident = AddressRange::from(layout.bootloader);
+    let home = AddressRange::from(layout.home.unwrap_or(layout.bootloader));
+    for (address, data) in bootloader.segments() {
+        let found = AddressRange { first: address, last: address.saturating_add(data.len() as u32 - 1) };
+        if !resident.contains(&found) && !home.contains(&found) {
+            return Err(ProvisionFault::Elsewhere { found, resident, home });
+        }
+    }
+    match bootloader.span().first {
+        found if found != resident.first => Err(ProvisionFault::Start { found, start: resident.first }),
+        _ => Ok(()),
+    }
 }
 
 /// The sectors that belong under write protection in a device with this bootloader, as
