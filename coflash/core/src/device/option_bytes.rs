@@ -208,6 +208,13 @@ mod tests {
         }
     }
 
+    /// The numbers of the test before.
+    #[test]
+    fn those_of_a_product_are_the_factorys_with_two_fields() {
+        assert_eq!(OptionBytes::of_product(3, 0b1_0001), OptionBytes(0x0FEE_AAE1));
+        assert_eq!(OptionBytes::of_product(2, 0), OptionBytes(0x0FFF_AAE5));
+    }
+
     #[test]
     fn what_is_wrong_for_a_product_is_told_with_the_cure() {
         let reported = |value, words: &[&str]| {
