@@ -10,7 +10,7 @@ use coflash_core::file::factory::{Bootloader, Fault};
 use coflash_core::file::judge::Fault as Judged;
 use coflash_core::file::nameplate::nameplate;
 use coflash_core::file::sealed::provision::protected_sectors;
-use coflash_core::file::{elf, ihex, Image, Target};
+use coflash_core::file::{convert, elf, ihex, program_of, read, Firmware, Format, Image, Target};
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Machine, Options};
 use emulator::time::Time;
@@ -52,7 +52,7 @@ fn the_first_power_on_starts_the_program_and_no_frame_asks_for_it() {
     bench.call_back();
     says(&mut bench, firmware::APP_V1, 1, true);
     // It has returned, so it is a confirmed one, and an ordinary update follows.
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {})
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     bench.restart();
     says(&mut bench, firmware::APP_V2, 2, false);
@@ -64,7 +64,7 @@ fn the_first_power_on_starts_the_program_and_no_frame_asks_for_it() {
 fn the_records_are_those_that_the_device_writes() {
     let mut updated = Bench::new().switched_on();
     let options = FlashOptions::default().trial_run(false);
-    flash(&mut updated.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    flash(&mut updated.session(), firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
     let made = board(&version_1());
     let of_tool = journal(&made);
     let of_device = journal(&updated);
@@ -149,7 +149,7 @@ fn the_option_bytes_protect_the_bootloader_and_nothing_else() {
     bench.call_back();
     let state = bench.session().read_number(Address::new(0x2007, 6)).unwrap();
     assert_eq!((OptionBytes(state).protected(), OptionBytes(state).warnings()), (protect, vec![]));
-    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {})
+    flash(&mut bench.session(), firmware::blocks(firmware::APP_V2), &FlashOptions::default(), &mut |_| {})
         .unwrap();
     says(&mut bench, firmware::APP_V2, 2, false);
 }
@@ -198,10 +198,7 @@ fn what_does_not_fit_is_refused() {
     let tail = &tail[tail.len() - 64..];
     let at = elf.windows(64).rposition(|bytes| bytes == tail).unwrap();
     elf[at + 63] ^= 1;
-    let coflash_core::file::Firmware::Image(damaged) = coflash_core::file::read(&elf, None, None).unwrap()
-    else {
-        panic!("an ELF")
-    };
+    let Firmware::Image(damaged) = read(&elf, None, None).unwrap() else { panic!("an ELF") };
     assert!(matches!(of(damaged, board), Err(Fault::RamImage(_))));
 
     let raw = firmware::raw(firmware::APP_V1);
@@ -212,6 +209,11 @@ fn what_does_not_fit_is_refused() {
     let count = board.programs.len();
     let refused = boot.plain(9, &firmware::blocks(firmware::APP_V1)).map(drop);
     assert_eq!(refused, Err(Fault::NoProgram(9, count)));
+    let size = board.programs[0].size as usize + 4;
+    let long = firmware::made_up(size, |_| 0);
+    let long = read(&long, Some(Format::Raw), Some(board.programs[0].base)).unwrap();
+    let long = program_of(long, &convert::Options::default()).unwrap().program;
+    assert!(matches!(boot.plain(1, &long).map(drop), Err(Fault::Elsewhere(..))), "past the end");
     let other = firmware::with_label(raw, &Label::new(0, 1, 1));
     let refused = boot.plain(1, &firmware::blocks_of_raw(&other)).map(drop);
     assert!(matches!(refused, Err(Fault::Identity { .. })), "{refused:?}");

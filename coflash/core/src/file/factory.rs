@@ -69,6 +69,11 @@ pub enum Fault {
     /// The board has no such program.
     #[error("the board has no program {0}: it has {1}")]
     NoProgram(u8, usize),
+    /// It lies elsewhere, or reaches over the end.
+    #[error(
+        "it lies at {0}, and the program of this board at {1}: link it for that place, or make it smaller"
+    )]
+    Elsewhere(AddressRange, AddressRange),
     /// It is not a program for this place.
     #[error("it {0}: {advice}", advice = .0.advice())]
     Program(judge::Fault),
@@ -178,8 +183,9 @@ impl Bootloader {
         // After the blocks is a byte for each, which locks it.
         let is_inside =
             AddressRange { first: OTP.base, last: OTP.end() + BLOCKS as u32 - 1 }.contains(&plate.span());
-        let words =
-            plate.bytes::<{ SIZE as usize }>(first).filter(|_| is_inside && (first - OTP.base) % SIZE == 0);
+        let words = plate
+            .bytes::<{ SIZE as usize }>(first)
+            .filter(|_| is_inside && (first - OTP.base).is_multiple_of(SIZE));
         let parsed =
             words.and_then(|bytes| Nameplate::parse(&std::array::from_fn(|at| word(&bytes, 4 * at))));
         if !Abilities(self.facts.abilities.into()).has(Abilities::NAMEPLATE) {
@@ -242,6 +248,8 @@ impl Bootloader {
         if self.is_sealed() {
             return Err(Fault::Unsealed);
         }
+        let region = self.region(number)?.into();
+        program.check_region(region).map_err(|_| Fault::Elsewhere(program.span(), region))?;
         for target in program.targets().into_iter().flatten() {
             self.check_identity(target)?;
         }
