@@ -34,9 +34,11 @@ pub fn slot(tag: u32, [a, b, c, d]: Value, crc32: impl FnOnce(&[u8]) -> u32) -> 
     [tag, a, b, c, d, crc32(&bytes), MARK]
 }
 
-/// The header of a region: of two valid ones, that with the later sequence number counts.
-pub fn header_slot(sequence: u32, crc32: impl FnOnce(&[u8]) -> u32) -> Slot {
-    slot(HEADER_MAGIC, [sequence, !sequence, FORMAT, u32::MAX], crc32)
+/// The value of a region's header, whose tag is [`HEADER_MAGIC`]: of two valid ones, that with the later sequence
+/// number counts.
+#[must_use]
+pub const fn header(sequence: u32) -> Value {
+    [sequence, !sequence, FORMAT, u32::MAX]
 }
 
 /// The value of [`Key::NODE`]: a node-ID, 255 for none (CiA 305), and a bit rate, an index of CiA 305 table 1.

@@ -15,7 +15,7 @@ use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Machine, Options};
 use emulator::time::Time;
 use kit::rig::crc32;
-use shared_abi::journal::{self as codec, header_slot, slot};
+use shared_abi::journal::{self as codec, slot};
 use shared_abi::label::Label;
 use shared_abi::layout::Layout;
 use shared_abi::nameplate::Nameplate;
@@ -111,7 +111,10 @@ fn firmware_of(file: &Image) -> Vec<u8> {
 fn an_older_journal_does_not_count() {
     let [_, other] = firmware::board().parameters;
     let mut bench = Bench::new();
-    let old = [header_slot(7, crc32), slot(Key::NODE.0, codec::node(9, BitRate::K125 as u8), crc32)];
+    let old = [
+        slot(HEADER, codec::header(7), crc32),
+        slot(Key::NODE.0, codec::node(9, BitRate::K125 as u8), crc32),
+    ];
     let bytes: Vec<u8> = old.into_iter().flatten().flat_map(u32::to_le_bytes).collect();
     bench.machine().load_bin(other.base, &bytes).unwrap();
     bench.soil_programs();

@@ -9,7 +9,7 @@ use seal::wire::{array, flag, word};
 use shared_abi::abilities::Abilities;
 use shared_abi::block_file::fits;
 use shared_abi::geometry::{Region, OTP};
-use shared_abi::journal::{self, header_slot, slot, Key, ProgramRecord, Seal, Value, SLOT_SIZE};
+use shared_abi::journal::{self, slot, Key, ProgramRecord, Seal, Value, HEADER_MAGIC, SLOT_SIZE};
 use shared_abi::layout::{toml::Toml, Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::nameplate::{Nameplate, BLOCKS};
 use shared_abi::ram_image::Header;
@@ -350,7 +350,7 @@ impl Bootloader {
         let mut slots = Pieces::default();
         let [to, _] = self.layout.parameters;
         let checksum = |bytes: &[u8]| CRC.checksum(bytes);
-        let header = header_slot(1, checksum);
+        let header = slot(HEADER_MAGIC, journal::header(1), checksum);
         let node = self.node.map(|(id, bit_rate)| (Key::NODE, journal::node(id.get(), bit_rate as u8)));
         let records = node.into_iter().chain(first.more.iter().copied());
         let records = records.chain([(Key::program(first.number), first.record.value())]);

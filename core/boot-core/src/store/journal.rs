@@ -25,7 +25,7 @@ use shared_abi::geometry::Region;
 use shared_abi::journal::{self, first_slot, Key, Slot, Value, FORMAT, HEADER_MAGIC, MARK_WORD, SLOT_SIZE};
 
 use super::parameters::{Parameters, StoreError};
-use crate::crc::crc32;
+use crate::crc;
 use crate::flash::{Flash, FlashFault, Next, Operation, ERASED};
 use crate::sequence::{EraseSectors, ProgramWords};
 
@@ -409,9 +409,9 @@ fn sound_slot<F: Flash>(flash: &F, at: u32) -> Option<Slot> {
 }
 
 fn slot(tag: u32, value: Value) -> Slot {
-    journal::slot(tag, value, crc32)
+    journal::slot(tag, value, |bytes| crc::resume(0, bytes))
 }
 
 fn header_slot(sequence: u32) -> Slot {
-    journal::header_slot(sequence, crc32)
+    slot(HEADER_MAGIC, journal::header(sequence))
 }
