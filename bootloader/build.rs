@@ -72,8 +72,12 @@ fn product(package: &Path, out: &Path) -> String {
     );
     println!("cargo:rerun-if-changed={}", file.display());
     let name = file.file_stem().and_then(|name| name.to_str()).unwrap_or_default();
+    // A product with an EEPROM has a store of its own (docs/eeprom.md).
+    let has_store = fs::read_to_string(&file).is_ok_and(|text| text.contains("pub type Parameters ="));
+    let store = if has_store { "chosen" } else { "in_flash" };
     let text = format!(
-        "#[path = {file:?}]\nmod chosen;\n/// The name of this product.\npub const NAME: &str = {name:?};\n"
+        "#[path = {file:?}]\nmod chosen;\npub use {store}::{{parameters, Parameters}};\n/// The name of this \
+         product.\npub const NAME: &str = {name:?};\n"
     );
     fs::write(out.join("product.rs"), text).expect("OUT_DIR is writable");
 

@@ -620,13 +620,18 @@ pub const FACTS: Facts = Facts {
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;
 
-/// The store of this product's parameters. A product with an EEPROM puts its own
-/// [`boot_core::store::Parameters`] here.
-pub type Parameters = Journal;
+/// The store of a product whose file has none of its own (build.rs): the journal in flash.
+#[allow(dead_code, reason = "another product has a store of its own")]
+mod in_flash {
+    use super::{Flash, Journal, LAYOUT};
 
-/// The parameters of this device.
-pub fn parameters(flash: &impl Flash) -> Parameters {
-    Journal::open(flash, LAYOUT.parameters)
+    /// The store of this product.
+    pub type Parameters = Journal;
+
+    /// The parameters of this device.
+    pub fn parameters(flash: &impl Flash) -> Parameters {
+        Journal::open(flash, LAYOUT.parameters)
+    }
 }
 
 /// Node-ID and bit rate of a device that has none stored.

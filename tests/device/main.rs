@@ -10,6 +10,8 @@ mod crystal;
 #[cfg(split_map)]
 mod debugger;
 mod device;
+#[cfg(split_map)]
+mod eeprom;
 mod factory;
 mod handover;
 mod hostile_bus;

@@ -2,5 +2,7 @@
 
 mod demonstration;
 mod download;
+mod eeprom;
 mod files;
+mod parameters;
 mod serial_flash;

@@ -24,6 +24,8 @@ pub const BOOTLOADER_SWITCHES: &str = "bootloader-switches.elf";
 pub const BOOTLOADER_WATCHDOG: &str = "bootloader-watchdog.elf";
 /// The bootloader that two resets by the NRST pin keep, and that starts the loader in the ROM.
 pub const BOOTLOADER_WAYS_IN: &str = "bootloader-ways-in.elf";
+/// The bootloader whose parameters are in an EEPROM.
+pub const BOOTLOADER_EEPROM: &str = "bootloader-eeprom.elf";
 /// The bootloaders for masters that expect Paulus, and for masters that expect the boot loader of
 /// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";

@@ -70,6 +70,8 @@ pub const VARIANTS: &[Variant] = table![
     product("bootloader-watchdog", "watchdog"),
     // Ways into a bootloader without an entry strap.
     product("bootloader-ways-in", "ways-in"),
+    // Its parameters are in an EEPROM.
+    product("bootloader-eeprom", "eeprom"),
     // They log their work, each one in another way (`cargo xtask emulate --log=WAY`).
     bootloader("bootloader-log-rtt", "log-rtt"),
     bootloader("bootloader-log-defmt", "log-defmt"),
@@ -137,7 +139,8 @@ impl Variant {
     /// Whether only the split map has room for it, or for the bootloader that it needs.
     fn needs_split(&self) -> bool {
         const FEATURES: [&str; 6] = ["debugger", "log-defmt", "log-rtt", "log-uart", "sealed", "virtual-can"];
-        self.product == Some("crc-16") || self.features.split(',').any(|feature| FEATURES.contains(&feature))
+        matches!(self.product, Some("crc-16" | "eeprom"))
+            || self.features.split(',').any(|feature| FEATURES.contains(&feature))
     }
 
     /// The product of the image.
