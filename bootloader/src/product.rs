@@ -623,7 +623,9 @@ pub const VERSION: u32 = 0x0000_0001;
 /// The store of a product whose file has none of its own (build.rs): the journal in flash.
 #[allow(dead_code, reason = "another product has a store of its own")]
 mod in_flash {
-    use super::{Flash, Journal, LAYOUT};
+    use boot_core::flash::Flash;
+    use boot_core::store::Journal;
+    use bsp::LAYOUT;
 
     /// The store of this product.
     pub type Parameters = Journal;

@@ -9,7 +9,6 @@ use shared_abi::wiring::Wiring;
 
 use crate::can::BitTiming;
 use crate::clock::ClockTree;
-use crate::functions::Functions;
 use crate::identity::Identity;
 use crate::voltage;
 
@@ -132,6 +131,31 @@ impl Strap {
         };
         holds != self.pressed
     }
+}
+
+/// The functions of a board (docs/porting.md, "A board's own functions"). One that is `None` costs nothing.
+///
+/// Each runs in the resident part of the bootloader, from flash, and in its RAM image, where code and constants
+/// are in RAM and the flash may be busy; [`each_10_ms`](Self::each_10_ms) and
+/// [`before_leaving`](Self::before_leaving) in the application template, too. So they use neither the flash
+/// controller, nor interrupts, nor a `static` (with one, the resident part does not link: an application owns the
+/// RAM), nor an address in flash, and return within a millisecond.
+#[derive(Clone, Copy, Debug)]
+pub struct Functions {
+    /// The first thing after each reset, when the core runs from HSI: a pin that holds the power, outputs that are
+    /// safe. An application that jumps to the bootloader leads here, too. The boot stage leaves what it has set up to
+    /// the bootloader and to the programs, which find all else as after a reset.
+    pub init: Option<fn()>,
+    /// At most 10 ms after the call before, as long as the software proves that it works; some ms later in a RAM
+    /// image that computes. To be toggled: an external watchdog.
+    pub each_10_ms: Option<fn()>,
+    /// Before a program starts, and before a reset that bootloader or application make themselves.
+    pub before_leaving: Option<fn()>,
+}
+
+impl Functions {
+    /// A board that has facts alone.
+    pub const NONE: Self = Self { init: None, each_10_ms: None, before_leaving: None };
 }
 
 /// The identity that the device reports.

@@ -1,33 +1,10 @@
 //! What a board does: the functions of its file.
 
+#[cfg(doc)]
+use crate::facts::Functions;
 use crate::facts::FACTS;
 #[cfg(target_arch = "arm")]
 use cortex_m::peripheral::{syst::SystClkSource, SYST};
-
-/// The functions of a board (docs/porting.md, "A board's own functions"). One that is `None` costs nothing.
-///
-/// Each runs in the resident part of the bootloader, from flash, and in its RAM image, where code and constants
-/// are in RAM and the flash may be busy; [`each_10_ms`](Self::each_10_ms) and
-/// [`before_leaving`](Self::before_leaving) in the application template, too. So they use neither the flash
-/// controller, nor interrupts, nor a `static` (with one, the resident part does not link: an application owns the
-/// RAM), nor an address in flash, and return within a millisecond.
-#[derive(Clone, Copy, Debug)]
-pub struct Functions {
-    /// The first thing after each reset, when the core runs from HSI: a pin that holds the power, outputs that are
-    /// safe. An application that jumps to the bootloader leads here, too. The boot stage leaves what it has set up to
-    /// the bootloader and to the programs, which find all else as after a reset.
-    pub init: Option<fn()>,
-    /// At most 10 ms after the call before, as long as the software proves that it works; some ms later in a RAM
-    /// image that computes. To be toggled: an external watchdog.
-    pub each_10_ms: Option<fn()>,
-    /// Before a program starts, and before a reset that bootloader or application make themselves.
-    pub before_leaving: Option<fn()>,
-}
-
-impl Functions {
-    /// A board that has facts alone.
-    pub const NONE: Self = Self { init: None, each_10_ms: None, before_leaving: None };
-}
 
 /// Whether the board has [`Functions::each_10_ms`].
 pub const HAS_EACH_10_MS: bool = FACTS.functions.each_10_ms.is_some();
@@ -64,7 +41,8 @@ pub fn before_leaving() {
 pub unsafe fn begin(core: u32) {
     if HAS_EACH_10_MS {
         // SAFETY: the caller guarantees it.
-        let mut timer = crate::cleared_systick(unsafe { systick() });
+        let mut timer = unsafe { systick() };
+        timer.clear_current();
         timer.set_clock_source(SystClkSource::Core);
         timer.set_reload(core / 100 - 1);
         timer.enable_counter();

@@ -8,10 +8,10 @@ pub fn inputs(_port: char) -> u16 {
 }
 
 /// See the driver: an output of a board's functions.
-pub fn drive(_pin: crate::Pin, _high: bool) {}
+pub fn drive(_pin: shared_abi::geometry::Pin, _high: bool) {}
 
 /// See the driver: the other level of an output.
-pub fn toggle(_pin: crate::Pin) {}
+pub fn toggle(_pin: shared_abi::geometry::Pin) {}
 
 /// The count of the system timer.
 #[must_use]

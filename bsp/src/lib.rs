@@ -78,7 +78,6 @@ pub mod watchdog;
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, drive, entry_strap, init, inputs, toggle, Board, Led};
 pub use facts::*;
-pub use functions::Functions;
 #[cfg(not(target_arch = "arm"))]
 pub use host::{cycles, drive, inputs, toggle};
 pub use identity::{nameplate, serial_number, unique_id, Identity};

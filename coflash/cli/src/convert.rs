@@ -15,6 +15,7 @@ use seal::wire::CERTIFICATE;
 use serde_json::json;
 
 use super::context::Context;
+use super::file::same_file;
 use super::file::{warn, Input, Source};
 use super::output::Failure;
 use super::output_file;
@@ -321,10 +322,4 @@ impl Labels {
         };
         Ok(Label::Release { vendor_id, product_code, version, date })
     }
-}
-
-/// Whether two names refer to one file, as far as this can be determined.
-pub(super) fn same_file(one: &Path, other: &Path) -> bool {
-    let canonical = |path: &Path| path.canonicalize().ok();
-    one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))
 }

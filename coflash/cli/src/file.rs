@@ -317,3 +317,9 @@ pub(super) fn warn(context: &Context, file: &Path, notes: &[Note], left_out: u64
         ));
     }
 }
+
+/// Whether two names refer to one file, as far as this can be determined.
+pub(super) fn same_file(one: &Path, other: &Path) -> bool {
+    let canonical = |path: &Path| path.canonicalize().ok();
+    one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))
+}

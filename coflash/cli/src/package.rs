@@ -22,9 +22,9 @@ use seal::wire::CERTIFICATE;
 use serde_json::{json, Value};
 
 use super::context::Context;
-use super::convert::same_file;
 use super::device::{asked, cancelled, Patience};
 use super::file::front;
+use super::file::same_file;
 use super::many::{begin, end, Board};
 use super::output::Failure;
 use super::output_file;

@@ -17,8 +17,7 @@ use shared_abi::layout::Layout;
 use shared_abi::ram_image::Version;
 
 use crate::context::Context;
-use crate::convert::same_file;
-use crate::file::{warn, MemoryMap};
+use crate::file::{same_file, warn, MemoryMap};
 use crate::lss::bit_rate;
 use crate::output::Failure;
 use crate::output_file::{write, write_secret};
@@ -100,7 +99,7 @@ impl Factory {
             boot = boot.with_nameplate(&image).map_err(|fault| Failure::file(plate, fault))?;
         }
         if let Some((id, bit_rate)) = self.node_id.zip(self.bit_rate) {
-            boot = boot.with_node(id, bit_rate).map_err(refused)?;
+            boot = boot.with_node(id.get(), bit_rate as u8).map_err(refused)?;
         }
         let first = self.first(context, &boot, layout)?;
         warn(context, &self.first, Note::of_staging(first.image.span(), Some(layout)).as_slice(), 0);
@@ -183,7 +182,7 @@ impl Factory {
             None => String::new(),
         };
         let node = match boot.node {
-            Some((id, rate)) => format!("{id}, {} kbit/s", rate.bits_per_second().unwrap_or(0) / 1000),
+            Some((id, rate)) => format!("{id}, {} kbit/s", bits_per_second(rate).unwrap_or(0) / 1000),
             None => "that of the board, or by LSS".to_string(),
         };
         let label = label_of(&first.image, first.image.span().first);
@@ -210,8 +209,8 @@ impl Factory {
                 "bytes": bytes,
                 "bootloader": { "version": header.version, "crc": header.crc, "sealed": is_sealed },
                 "identity": boot.identity().map(|(vendor, product)| json!({ "vendor_id": vendor, "product_code": product })),
-                "node_id": boot.node.map(|(id, _)| id.get()),
-                "bit_rate": boot.node.and_then(|(_, rate)| rate.bits_per_second()),
+                "node_id": boot.node.map(|(id, _)| id),
+                "bit_rate": boot.node.and_then(|(_, rate)| bits_per_second(rate)),
                 "program": {
                     "number": first.number,
                     "size": record.size,
@@ -225,4 +224,9 @@ impl Factory {
             })
         });
     }
+}
+
+/// A bit rate of the table in CiA 305; `None` for the one that the device finds.
+fn bits_per_second(index: u8) -> Option<u32> {
+    BitRate::from_index(index).and_then(BitRate::bits_per_second)
 }

@@ -27,6 +27,9 @@ fn commands_with_a_board(folder: &Folder) -> Vec<String> {
     found
 }
 
+/// Those of production read a bootloader, too.
+const OF_PRODUCTION: [&str; 2] = ["seal-factory", "seal-provision"];
+
 /// What the commands need, and how they are called.
 struct Room {
     folder: Folder,
@@ -58,6 +61,7 @@ impl Room {
                 "more-conform",
                 format!("more conform SDO-001 --install --image {} --node 5", data("program.hex")),
             ),
+            ("seal-factory", format!("seal factory {boot} {} -o {out} --force", data("program.hex"))),
             ("seal-image", seal),
             ("seal-provision", format!("seal provision {boot} --root {root} -o {out} --force")),
         ]
@@ -84,7 +88,7 @@ fn a_board_may_be_a_file_in_every_command() {
     let higher = map().replace("base = 0x08010000, size = 0x70000", "base = 0x08020000, size = 0x60000");
     assert_ne!(higher, map());
     let higher = room.folder.file("higher.toml", higher.as_bytes());
-    for (name, words) in room.calls.iter().filter(|(name, _)| *name != "seal-provision") {
+    for (name, words) in room.calls.iter().filter(|(name, _)| !OF_PRODUCTION.contains(name)) {
         let (bus, server) = serve(Fake::new(APPLICATION));
         let is_on_the_bus = ["more-conform", "flash"].contains(name);
         let more: &[&str] = if is_on_the_bus { &["--bus", &bus] } else { &[] };
@@ -95,6 +99,9 @@ fn a_board_may_be_a_file_in_every_command() {
         // It is this map that counts: the file's program begins below the program of the other one.
         Room::call(words, &[more, &["--board", &higher]].concat()).fails(3, &["0x08010000"]);
     }
+    // The bootloader is not whole.
+    let (_, words) = room.calls.iter().find(|(name, _)| *name == "seal-factory").unwrap();
+    Room::call(words, &["--board", &board]).fails(3, &["bootloader.hex"]);
     // A compact board has no place for keys.
     let (_, words) = room.calls.iter().find(|(name, _)| *name == "seal-provision").unwrap();
     Room::call(words, &["--board", &board]).fails(3, &["compact memory map"]);

@@ -1,7 +1,6 @@
 //! A file for production: a bootloader, and a first program with the records that the device would have stored
 //! itself. A device from the line starts this program at its first power-on, without CAN.
 
-use canopen::{BitRate, NodeId};
 use seal::key_block::{
     COUNTER, EPOCH, FLAGS, FOR_TESTS, KEKS, KEK_COUNT, KEY, MAGIC, ROOTS, ROOT_COUNT, SIZE,
 };
@@ -120,7 +119,7 @@ pub struct Bootloader {
     pub header: Header,
     keys: Option<Keys>,
     /// Node-ID and bit rate, if the file has them; otherwise the device has those of the board.
-    pub node: Option<(NodeId, BitRate)>,
+    pub node: Option<(u8, u8)>,
     /// The identity of the device, if the file has it.
     pub nameplate: Option<Nameplate>,
 }
@@ -196,13 +195,16 @@ impl Bootloader {
         Ok(self)
     }
 
-    /// The same with node-ID and bit rate, as layer setting services store them.
+    /// The same with a node-ID, and a bit rate by its index in the table of CiA 305, as layer setting services store
+    /// them.
     ///
     /// # Errors
     /// [`Fault::Node`].
-    pub fn with_node(mut self, id: NodeId, bit_rate: BitRate) -> Result<Self, Fault> {
+    pub fn with_node(mut self, id: u8, bit_rate: u8) -> Result<Self, Fault> {
         let [lowest, highest] = self.facts.node_ids.to_le_bytes();
-        if !(lowest..=highest).contains(&id.get()) || self.facts.bit_rates >> bit_rate as u8 & 1 == 0 {
+        if !(lowest..=highest).contains(&id)
+            || self.facts.bit_rates.checked_shr(bit_rate.into()).unwrap_or(0) & 1 == 0
+        {
             return Err(Fault::Node(lowest, highest));
         }
         self.node = Some((id, bit_rate));
@@ -351,7 +353,7 @@ impl Bootloader {
         let [to, _] = self.layout.parameters;
         let checksum = |bytes: &[u8]| CRC.checksum(bytes);
         let header = slot(HEADER_MAGIC, journal::header(1), checksum);
-        let node = self.node.map(|(id, bit_rate)| (Key::NODE, journal::node(id.get(), bit_rate as u8)));
+        let node = self.node.map(|(id, bit_rate)| (Key::NODE, journal::node(id, bit_rate)));
         let records = node.into_iter().chain(first.more.iter().copied());
         let records = records.chain([(Key::program(first.number), first.record.value())]);
         let records = records.map(|(key, value)| slot(key.0, value, checksum));

@@ -2,9 +2,9 @@
 
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
-use shared_abi::journal;
+use shared_abi::journal::{self, Key, Value};
 
-use super::{Key, Parameters, Value};
+use super::parameters::Parameters;
 use crate::flash::Flash;
 
 /// The node-ID and the bit rate of a device.

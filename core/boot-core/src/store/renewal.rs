@@ -1,8 +1,9 @@
 //! The record of a renewal of the bootloader (docs/renewal.md).
 
+use shared_abi::journal::{Key, Value};
 use shared_abi::renewal::{State, BOOTLOADER};
 
-use super::{Key, Parameters, Value};
+use super::parameters::Parameters;
 use crate::flash::Flash;
 
 /// The stored record of a complete RAM image in staging. It is removed before the flash of staging
