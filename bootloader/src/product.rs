@@ -21,7 +21,7 @@ use boot_core::control::{self, Policy};
 use boot_core::decision;
 use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
-use boot_core::store::{Journal, NodeParameters};
+use boot_core::store::NodeParameters;
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::abilities::Abilities;

@@ -1,7 +1,7 @@
 //! The file for production: a device from the line starts its first program without CAN, and is an ordinary one.
 
 use boot_core::store::Key;
-use canopen::{Address, BitRate, NodeId};
+use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, HEARTBEAT, NODE};
 use coboot_tests::factory::{board, bootloader, first, image, journal, latest, program};
 use coboot_tests::firmware;
@@ -78,7 +78,7 @@ fn the_records_are_those_that_the_device_writes() {
 #[test]
 fn node_id_and_bit_rate_are_those_of_the_file() {
     let rate = BitRate::K500;
-    let boot = bootloader(firmware::BOOTLOADER).with_node(NodeId::new(9).unwrap(), rate).unwrap();
+    let boot = bootloader(firmware::BOOTLOADER).with_node(9, rate as u8).unwrap();
     let mut bench = board(&boot.join(&first(&boot, firmware::APP_V1)));
     bench.set_host_bit_rate(500_000);
     bench.power_on();
@@ -181,7 +181,7 @@ fn a_nameplate_is_the_identity_of_the_file() {
     let device = (0x123, 0x5EA1_0007);
     assert_eq!(with(8).map(drop), Err(Fault::Identity { program, device }));
     assert_eq!(of_oem().with_nameplate(&file).map(drop), Err(Fault::NoNameplate));
-    let node = |id| of_oem().with_node(NodeId::new(id).unwrap(), BitRate::K125).map(drop);
+    let node = |id| of_oem().with_node(id, BitRate::K125 as u8).map(drop);
     assert_eq!((node(2), node(1)), (Ok(()), Err(Fault::Node(2, 100))));
 }
 

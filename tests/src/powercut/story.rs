@@ -288,7 +288,7 @@ fn resume() -> Result<Story, String> {
 fn factory() -> Result<Story, String> {
     let boot = factory::bootloader(firmware::BOOTLOADER);
     let id = NodeId::new(NODE).ok_or("no node-ID")?;
-    let boot = boot.with_node(id, RATE).map_err(|fault| fault.to_string())?;
+    let boot = boot.with_node(id.get(), RATE as u8).map_err(|fault| fault.to_string())?;
     let mut bench = factory::board(&boot.join(&factory::first(&boot, firmware::APP_V1)));
     let start = bench.machine().flash_cells();
     Ok(Story { start, ..update(|bench| write(bench, &options()))? })
