@@ -42,17 +42,15 @@ impl Source {
             slow_down(rcc);
         }
         let tree = self.tree();
-        let mut bit = 0;
-        if self == Self::Crystal {
-            if !start_crystal(rcc) {
-                return Self::Internal.speed_up(rcc);
-            }
-            bit = PLLSRC_HSE;
+        if self == Self::Crystal && !start_crystal(rcc) {
+            return Self::Internal.speed_up(rcc);
         }
-        let (m, p, q) = (tree.hse / tree.pll_input, tree.pll_p / 2 - 1, tree.pll_q());
-        let pll = q << 24 | bit | p << 16 | tree.pll_n << 6 | m;
-        // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and R keep their reset values.
-        rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xF000_0000 | pll) });
+        let pll = match self {
+            Self::Internal => const { pllcfgr(&INTERNAL, 0) },
+            Self::Crystal => const { pllcfgr(&CLOCK_TREE, PLLSRC_HSE) },
+        };
+        // SAFETY: a valid word of PLLCFGR, which `checked` ensures.
+        rcc.pllcfgr().write(|w| unsafe { w.bits(pll) });
         // An application that jumped may have spread the clock, which CAN needs exact (section 7.3.23).
         rcc.sscgr().reset();
         raise_voltage(rcc);
@@ -75,6 +73,12 @@ impl Source {
         wait(rcc.cfgr().as_ptr(), SWS, SWS_PLL);
         self
     }
+}
+
+/// RCC_PLLCFGR for a tree; the reserved bits and R keep their reset values.
+const fn pllcfgr(tree: &ClockTree, source: u32) -> u32 {
+    let (m, p, q) = (tree.hse / tree.pll_input, tree.pll_p / 2 - 1, tree.pll_q());
+    reset::RCC_PLLCFGR & 0xF000_0000 | q << 24 | source | p << 16 | tree.pll_n << 6 | m
 }
 
 /// Switches the crystal on. Returns whether it runs before it is given up. One that fails later is an NMI, with the
