@@ -53,7 +53,7 @@ pub struct Silicon {
     /// of the datasheet, in thousandths; 500 is typical.
     pub threshold_permille: u32,
     /// Whether a peripheral takes some cycles after the store that switches its clock on: an access in the same
-    /// straight run of code is lost, unless it has a DSB, or reads the register of the clock back (ES0182, delay after
+    /// straight run of code is lost, unless it has a DSB, or reads a register of RCC before (ES0182, delay after
     /// an RCC peripheral clock enabling: 2 cycles of AHB, or 1 and the divider of APB).
     pub late_clocks: bool,
     /// Whether a request for transmission (TXRQ) is lost before the controller takes part in the bus. RM0090 section

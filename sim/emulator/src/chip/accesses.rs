@@ -192,8 +192,8 @@ impl Chip {
         let result = match self.place(address) {
             Place::Block { block, offset, enable } if self.has_clock(enable) && !self.is_late(enable) => {
                 if block == Block::Rcc {
-                    // Read back: the core waits for what it has written.
-                    self.late = self.late.filter(|late| late.register != offset);
+                    // The core waits for what it has written to this bus.
+                    self.late = None;
                 }
                 self.block_mut(block).read(offset, now)
             }
