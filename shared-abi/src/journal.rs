@@ -148,6 +148,21 @@ const WITHDRAWN: u32 = 1 << 28;
 const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH | WITHDRAWN);
 
 impl ProgramRecord {
+    /// The record of a program that is released, and is neither sealed nor confirmed.
+    #[must_use]
+    pub const fn released(size: u32, crc: u32) -> Self {
+        Self {
+            size,
+            crc,
+            signed: true,
+            confirmed: false,
+            version: 0,
+            half_erased: false,
+            seal: None,
+            withdrawn: false,
+        }
+    }
+
     /// The stored form of "no program", with the two words of the download that is going on.
     #[must_use]
     pub const fn none(half_erased: bool, [id, end]: [u32; 2]) -> Value {

@@ -104,7 +104,7 @@ fn removes(key: Key, value: Value) -> bool {
 /// The record of the new program, released.
 fn new_record() -> Value {
     let new = file(&STANDARD_2, NEW);
-    kit::rig::released(new.plain.len() as u32, new.crc).value()
+    ProgramRecord::released(new.plain.len() as u32, new.crc).value()
 }
 
 /// The same record, released.

@@ -15,7 +15,7 @@ use boot_core::decision::crash_count;
 use boot_core::flash::{run, Flash};
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
-use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters};
 use canopen::device::Device;
 use canopen::lss::LssDevice;
 use canopen::od::{Address, Entry, Objects};
@@ -636,20 +636,6 @@ pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
 pub fn blocks(base: u32, program: &[u8]) -> [Vec<u8>; 3] {
     let end = words(&[program.len() as u32, crc32(program)]);
     [block(0, 0, &[0; 8]), block(1, base, program), block(u32::MAX, 0, &end)]
-}
-
-/// The record of a program that is released, and is neither sealed nor confirmed.
-pub fn released(size: u32, crc: u32) -> ProgramRecord {
-    ProgramRecord {
-        size,
-        crc,
-        signed: true,
-        confirmed: false,
-        version: 0,
-        half_erased: false,
-        seal: None,
-        withdrawn: false,
-    }
 }
 
 pub fn words(words: &[u32]) -> Vec<u8> {

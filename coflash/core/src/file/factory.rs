@@ -256,12 +256,9 @@ impl Bootloader {
             self.check_identity(target)?;
         }
         let release = program.release();
-        let record = ProgramRecord {
-            size: program.size(),
-            crc: self.checksum().of_flash(program.start(), program.size(), program.image().runs()),
-            version: release.map_or(0, |release| release.version.0),
-            ..RELEASED
-        };
+        let crc = self.checksum().of_flash(program.start(), program.size(), program.image().runs());
+        let version = release.map_or(0, |release| release.version.0);
+        let record = ProgramRecord { version, ..ProgramRecord::released(program.size(), crc) };
         let date = release.map_or(0, |release| release.date);
         let date = u32::try_from(date).ok().filter(|date| *date != 0);
         let more = date.map(|date| (Key::date(number), [date, record.crc, 0, 0])).into_iter().collect();
@@ -306,13 +303,8 @@ impl Bootloader {
             (None, _) => return Err(Fault::Refused(Refusal::Kek)),
         };
         let seal = if has(flag::WRITES_FLASH) { Seal::WritesFlash } else { Seal::Locked };
-        let record = ProgramRecord {
-            size: head.size(),
-            crc: head.crc(),
-            version: head.version(),
-            seal: Some(seal),
-            ..RELEASED
-        };
+        let released = ProgramRecord::released(head.size(), head.crc());
+        let record = ProgramRecord { version: head.version(), seal: Some(seal), ..released };
         let mut image = Pieces::default();
         image.add(region.base, bytes, Place::File);
         // No older program of this device was good: the counter is not left to its confirmation.
@@ -369,18 +361,6 @@ impl Bootloader {
         joined(&[&self.image, &slots.in_order(), &first.image])
     }
 }
-
-/// The record of a program that is released and was never started.
-const RELEASED: ProgramRecord = ProgramRecord {
-    size: 0,
-    crc: 0,
-    signed: true,
-    confirmed: false,
-    version: 0,
-    half_erased: false,
-    seal: None,
-    withdrawn: false,
-};
 
 /// Images of different places as one.
 fn joined(images: &[&Image]) -> Image {

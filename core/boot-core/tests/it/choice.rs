@@ -9,7 +9,6 @@ use boot_core::decision::{choose, Autostart, Choice, Exit, Images, Policy, Start
 use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters, ProgramRecord, RenewalRecord, StoreError, Value};
 use kit::renewal::{words, HOME, SOUND, STAGING, TWO};
-use kit::rig::released;
 use shared_abi::boot_report::Reason;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::handoff::ResetCause::{self, *};
@@ -156,7 +155,7 @@ impl Device {
             let size = if program == TooLong { region.size + 1 } else { 64 };
             let crc = if program == OtherContents { 0 } else { crc32(&bytes) };
             let (signed, confirmed) = (program != Unreleased, program == Confirmed);
-            let record = ProgramRecord { signed, confirmed, ..released(size, crc) };
+            let record = ProgramRecord { signed, confirmed, ..ProgramRecord::released(size, crc) };
             flash.push((Region::new(region.base, 64), bytes));
             if program != Absent {
                 values.push((Key::program(number), record.value()));

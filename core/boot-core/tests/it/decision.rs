@@ -5,9 +5,8 @@ use boot_core::crc::CrcKind;
 use boot_core::decision::{choose, Exit, Images, Policy, Woken};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
-use boot_core::store::{Journal, Key, Parameters, Value};
+use boot_core::store::{Journal, Key, Parameters, ProgramRecord, Value};
 use kit::model::ModelFlash;
-use kit::rig::released;
 use shared_abi::boot_report::Reason;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -26,7 +25,12 @@ fn check(damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invali
     bytes[4..8].copy_from_slice(&0x0802_0189_u32.to_le_bytes());
     flash.poke(0x0802_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
-    store(&mut flash, &mut journal, Key::program(1), released(64, boot_core::crc32(&bytes)).value());
+    store(
+        &mut flash,
+        &mut journal,
+        Key::program(1),
+        ProgramRecord::released(64, boot_core::crc32(&bytes)).value(),
+    );
     damage(&mut flash);
     verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1)
 }
@@ -43,7 +47,12 @@ fn a_program_ends_inside_its_region() {
         let mut bytes = vec![0; size as usize];
         flash.read(region.base, &mut bytes);
         let mut journal = Journal::open(&flash, LAYOUT.parameters);
-        store(&mut flash, &mut journal, Key::program(1), released(size, boot_core::crc32(&bytes)).value());
+        store(
+            &mut flash,
+            &mut journal,
+            Key::program(1),
+            ProgramRecord::released(size, boot_core::crc32(&bytes)).value(),
+        );
         verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1).map(|_| ())
     };
     assert_eq!(verified(region.size), Ok(()));
@@ -82,7 +91,12 @@ fn a_journal_of_the_map_before_this_one_starts_nothing_and_can_be_written() {
         let program = [0xA5; 64];
         flash.poke(0x0801_0000, &program);
         let mut journal = Journal::open(&flash, before);
-        store(&mut flash, &mut journal, Key::program(1), released(64, boot_core::crc32(&program)).value());
+        store(
+            &mut flash,
+            &mut journal,
+            Key::program(1),
+            ProgramRecord::released(64, boot_core::crc32(&program)).value(),
+        );
         for count in 0..stores {
             store(&mut flash, &mut journal, Key::CRASH_COUNT, [count % 3, 0, 0, 0]);
         }

@@ -10,7 +10,6 @@ use kit::bench::{block, node, program, Bench, CLEAR, CLR_SIGNATURE, CONFIG, CONT
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, ONE_PROGRAM};
 use kit::renewal::LARGE_JOURNAL;
-use kit::rig::released;
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::Layout;
@@ -827,7 +826,7 @@ fn the_record_of_a_program_has_its_words() {
         (true, true, flags(b"RUN1")),
     ] {
         for (half_erased, first) in [(false, 0x0000_1234), (true, 0x8000_1234)] {
-            let record = released(0x1234, 0xCAFE_F00D);
+            let record = ProgramRecord::released(0x1234, 0xCAFE_F00D);
             let record = ProgramRecord { signed, confirmed, version: 77, half_erased, ..record };
             assert_eq!(record.value(), [first, 0xCAFE_F00D, word, 77]);
             assert_eq!(ProgramRecord::from_value(record.value()), Some(record));
@@ -850,7 +849,7 @@ fn a_withdrawn_program_is_not_released_by_its_flags() {
     use boot_core::store::Seal;
 
     let seal = Some(Seal::Locked);
-    let record = ProgramRecord { confirmed: true, version: 7, seal, ..released(0x1234, 1) };
+    let record = ProgramRecord { confirmed: true, version: 7, seal, ..ProgramRecord::released(0x1234, 1) };
     let record = ProgramRecord { signed: false, withdrawn: true, ..record };
     let confirmed = u32::from_le_bytes(*b"RUN0");
     assert_eq!(record.value(), [0x5000_1234, 1, confirmed, 7]);
